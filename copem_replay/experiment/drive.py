@@ -21,8 +21,9 @@ from copem_replay.core.tracks import Float
 from copem_replay.core.yaml import Key
 from copem_replay.experiment.degrees import resolve_degrees
 from copem_replay.experiment.schema import Configuration, Experiment, LogSettings, Unit
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError, shred_messages
+from copem_replay.io.encodings.columns import shred_messages
 from copem_replay.io.log import gather_messages
 from copem_replay.io.open import open_log
 from copem_replay.io.stamps import find_stamp_paths, parse_nanoseconds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -31,6 +32,11 @@ class Channel:
     schema_data: bytes = field(default=b"", repr=False)
     ahead_ns: int = 0  # how far the clock of the stamps in its messages is ahead of that of the log times
     part: str = ""  # the recording it comes from, of several of one drive
+    metadata: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+
+
+class DefinitionError(ValueError):
+    """A definition of messages that cannot be used, and why."""
 
 
 def schema_name(channel: Channel) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from copem_replay.io.encodings.columns import DefinitionError
+from copem_replay.io.channel import DefinitionError
 
 MOST_OBJECTS: Final = 100_000
 """Objects of one message: a city has fewer at a time. Points of lane boundaries and of outlines are none."""

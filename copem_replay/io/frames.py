@@ -21,9 +21,8 @@ import numpy as np
 from copem_replay.core.errors import EgoError, RecordingError, count_noun
 from copem_replay.core.interpolation import compose_rotations, invert_rotation, rotate_vectors, yaw_of
 from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int
-from copem_replay.io.channel import Channel, schema_name
+from copem_replay.io.channel import Channel, DefinitionError, schema_name
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError
 from copem_replay.io.findings import VX, VY, YAW, X, Z, find
 from copem_replay.io.ground_truth import MAX_GAP_S, DecodedObjects
 from copem_replay.io.log import Log, gather_messages

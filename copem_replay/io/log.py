@@ -11,10 +11,10 @@ import io
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import zstandard
 from mcap.exceptions import EndOfFile
@@ -110,6 +110,9 @@ _READ_AT_ONCE = 1 << 16
 """Bytes of the buffer of a file: a call of Python for as many takes no time beside reading them."""
 
 
+Result = TypeVar("Result")
+
+
 class BrokenIndexError(Exception):
     """An index that seemed sound is wrong, or what it points at is damaged; `Log.from_start` reads without it."""
 
@@ -161,16 +164,24 @@ class Log:
         for message in self.messages(numbers):
             yield message.channel_id, message.log_time, message.data
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages of some channels: by log time through the index, else as in the file, up to the damage.
 
-        Raises BrokenIndexError.
+        `sort`: those of a file without an index, too, are in order of log time. Raises BrokenIndexError.
         """
         spans = self.spans(numbers)
         with open_file(self.path) as file:
-            for message in self._by_index(file, spans) if self.indexed else RecordsFromStart(file):
-                if isinstance(message, Message) and is_kept(spans, message.channel_id, message.log_time):
-                    yield message
+            messages = self._by_index(file, spans) if self.indexed else _read_from_start(file, spans)
+            yield from sorted(messages, key=_log_time) if sort and not self.indexed else messages
+
+    def attempt(self, read: Callable[[Log], Result]) -> Result:
+        """What `read` gives of the log, opened without indexes that turn out to be broken. Raises RecordingError."""
+        log = self
+        while True:  # of several files each may have one
+            try:
+                return read(log)
+            except BrokenIndexError as error:
+                log = log.from_start(error)
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The recording opened without the index that turned out to be broken. Raises RecordingError."""
@@ -191,6 +202,16 @@ class Log:
                 raise ValueError(f"the index promises {promised} messages, and there are {count}")
         except DAMAGE as error:
             raise BrokenIndexError(self.path) from drop_traceback(error)
+
+
+def _read_from_start(file: IO[bytes], spans: Mapping[int, Span]) -> Iterator[Message]:
+    for record in RecordsFromStart(file):
+        if isinstance(record, Message) and is_kept(spans, record.channel_id, record.log_time):
+            yield record
+
+
+def _log_time(message: Message) -> int:
+    return message.log_time
 
 
 class _File(io.FileIO):
@@ -336,6 +357,7 @@ def _make_channel(number: int, channel: Any, schema: Any, messages: int, expecte
         schema_data=schema.data if schema is not None else b"",
         ahead_ns=_ahead_ns(channel.metadata.get(AHEAD, "")),
         part=channel.metadata.get(PART, ""),
+        metadata=dict(channel.metadata),
     )
 
 

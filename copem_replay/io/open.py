@@ -1,8 +1,8 @@
 """Opening a recording: the container of a path, several recordings of one drive as one log, and file stamps.
 
-`CONTAINERS` lists the containers. Recordings of a drive become one log in order of log time by the clock of the first
-of them. A topic that several files have is named after its file, `rsu:/objects`. Log times are brought to the first
-clock here; stamps in messages where they are decoded, by `Channel.ahead_ns`.
+Recordings of a drive become one log in order of log time by the clock of the first of them. A topic that several files
+have is named after its file, `rsu:/objects`. Log times are brought to the first clock here; stamps in messages where
+they are decoded, by `Channel.ahead_ns`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Self, TypeAlias, overload
+from typing import NamedTuple, Self, TypeAlias, overload
 
 from mcap.records import Message
 
@@ -172,7 +172,6 @@ class JoinedRecording:
     log: Log
     numbers: Mapping[int, int]
     ahead_ns: int
-    label: str
 
 
 @dataclass(frozen=True)
@@ -182,13 +181,13 @@ class JoinedLog(Log):
     place: DriveRecordings = field(default_factory=lambda: DriveRecordings((), ()))
     parts: tuple[JoinedRecording, ...] = ()
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages of some channels in order of log time. Raises BrokenIndexError."""
         streams: list[tuple[int, Callable[[], Iterator[Message]]]] = []
         for part in self.parts:
             numbers_in_log = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
             if numbers_in_log:
-                streams.append((part.log.start_ns - part.ahead_ns, partial(_read_moved, part, numbers_in_log)))
+                streams.append((part.log.start_ns - part.ahead_ns, partial(_read_moved, part, numbers_in_log, sort)))
         yield from merge_streams(streams)
 
     def file_bytes(self) -> int:
@@ -236,10 +235,11 @@ def join_logs(place: DriveRecordings, logs: Sequence[Log]) -> JoinedLog:
         numbers = {}
         for c in log.channels:
             numbers[c.number] = len(channels) + 1
-            topic = label_topic(c.topic, label) if files[c.topic] > 1 else c.topic
-            moved = replace(c, number=len(channels) + 1, topic=topic, ahead_ns=c.ahead_ns + ahead_ns)
-            channels.append(replace(moved, part=recording_label(label, c.part)))
-        parts.append(JoinedRecording(log, numbers, ahead_ns, label))
+            topic = f"{label}:{c.topic}" if files[c.topic] > 1 else c.topic
+            part = f"{label}/{c.part}" if c.part else label  # of one in a file that was itself written from several
+            ahead_of_first_ns = c.ahead_ns + ahead_ns
+            channels.append(replace(c, number=numbers[c.number], topic=topic, ahead_ns=ahead_of_first_ns, part=part))
+        parts.append(JoinedRecording(log, numbers, ahead_ns))
     damages = [f"{log.path.name}: {log.damage}" for log in logs if log.damage]
     return JoinedLog(
         path=place.paths[0],
@@ -255,16 +255,6 @@ def join_logs(place: DriveRecordings, logs: Sequence[Log]) -> JoinedLog:
         parts=tuple(parts),
         tags={name: value for log in reversed(logs) for name, value in log.tags.items()},
     )
-
-
-def label_topic(topic: str, label: str) -> str:
-    """The name of a topic that several files have: `rsu:/objects`."""
-    return f"{label}:{topic}"
-
-
-def recording_label(label: str, before: str) -> str:
-    """The recording of a channel, `rsu` or, in a file that was itself written from several (`before`), `rsu/ego`."""
-    return f"{label}/{before}" if before else label
 
 
 def label_files(paths: Sequence[Path]) -> list[str]:
@@ -287,36 +277,14 @@ def _shift_window(window: Window | None, ahead_ns: int) -> Window | None:
     return replace(window, from_ns=from_ns, to_ns=to_ns)
 
 
-def _read_moved(part: JoinedRecording, numbers: Mapping[int, int]) -> Iterator[Message]:
-    for m in part.log.messages(numbers.keys()):
-        yield move_to_first_clock(m, numbers[m.channel_id], part.ahead_ns)
+def _read_moved(part: JoinedRecording, numbers: Mapping[int, int], sort: bool) -> Iterator[Message]:
+    """Messages with their times by the first clock."""
+    for m in part.log.messages(numbers.keys(), sort=sort):
+        log_time, publish_time = (max(t - part.ahead_ns, 0) for t in (m.log_time, m.publish_time))
+        yield Message(numbers[m.channel_id], log_time, m.data, publish_time, m.sequence)
 
 
-def move_to_first_clock(message: Message, number: int, ahead_ns: int) -> Message:
-    """The message on channel `number`, with its times by the first clock."""
-    times = (max(t - ahead_ns, 0) for t in (message.log_time, message.publish_time))
-    log_time, publish_time = times
-    return Message(number, log_time, message.data, publish_time, message.sequence)
-
-
-# Containers, and opening.
-
-
-@dataclass(frozen=True)
-class Container:
-    """A container: which paths it takes, and how one of them is opened. `open` raises RecordingError."""
-
-    name: str
-    takes: Callable[[Path], bool]
-    open: Callable[[Path], Log]
-
-
-CONTAINERS: Final = (
-    Container("rosbag2 folder", Path.is_dir, open_bag),
-    Container("OSI single-channel trace", is_trace, open_trace),
-    Container("MCAP file", lambda _path: True, open_mcap),  # any other path: errors say what the file is instead
-)
-"""The first container that takes a path opens it."""
+# Opening.
 
 
 def open_log(place: Local) -> Log:
@@ -332,7 +300,9 @@ def find_drive_recordings(log: Log) -> DriveRecordings | None:
 
 
 def _open_one(path: Path) -> Log:
-    return next(container for container in CONTAINERS if container.takes(path)).open(path)
+    if path.is_dir():
+        return open_bag(path)
+    return open_trace(path) if is_trace(path) else open_mcap(path)  # of any other path its error says what it is
 
 
 def name_log(path: Path) -> str:

@@ -25,10 +25,10 @@ from copem_replay.core.errors import RecordingError
 from copem_replay.core.files import parse_json
 from copem_replay.core.interpolation import wrap_angles
 from copem_replay.core.tracks import CLASSES, UNCERTAINTIES, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.io.channel import LAST_NS, schema_name
+from copem_replay.io.channel import LAST_NS, DefinitionError, schema_name
 from copem_replay.io.decoded_size import DecodeAllowance, OversizeError, check_objects
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError, shred_messages
+from copem_replay.io.encodings.columns import shred_messages
 from copem_replay.io.findings import (
     MOST_SHARE,
     VX,
@@ -42,12 +42,12 @@ from copem_replay.io.findings import (
     sift_states,
 )
 from copem_replay.io.frames import LogContext, read_decoded_lists, read_log_context, transform_to_world
-from copem_replay.io.log import BrokenIndexError, Log, gather_messages
+from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.open import Local, open_log
 from copem_replay.io.schemas import osi_ground_truth as osi
 from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
-from copem_replay.io.schemas.registry import DETAIL_SCHEMA, known_lists
+from copem_replay.io.schemas.registry import DETAIL_SCHEMA, STRING, known_lists
 from copem_replay.io.stamps import refuse_second_run, settle_stamps
 from copem_replay.io.window import Window
 
@@ -205,11 +205,7 @@ def _make_recorded(
 
 def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
     """Entries on `topic`, and details by the time in ns at which their list was available, then by object id."""
-    log = open_log(path).within(window)
-    try:
-        return _read_messages(log, topic)
-    except BrokenIndexError as error:
-        return _read_messages(log.from_start(error), topic)
+    return open_log(path).within(window).attempt(lambda log: _read_messages(log, topic))
 
 
 def _no_lists_message(log: Log, topic: str) -> str:
@@ -411,11 +407,7 @@ def read_described_lists(
 
     Raises RecordingError.
     """
-    log = open_log(path).within(window)
-    try:
-        return _read_described(log, topic, scene, around)
-    except BrokenIndexError as error:
-        return _read_described(log.from_start(error), topic, scene, around)
+    return open_log(path).within(window).attempt(lambda log: _read_described(log, topic, scene, around))
 
 
 def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:
@@ -433,8 +425,6 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
     """The content of the topic `…/detail` beside a topic, by the time in ns at which each list was available."""
     beside = f"{topic.removesuffix('/objects')}/detail"
-    from copem_replay.io.write.ros2 import STRING
-
     channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]
     details: dict[int, dict[str, Any]] = {}
     for channel in channels:

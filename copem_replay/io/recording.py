@@ -139,17 +139,10 @@ def read_log(
     Raises RecordingError, one line: no such file, no MCAP file, no truth, no usable object, no such ego, no such topic,
     or several, a file that changes while it is read; EmptyWindowError.
     """
-    read = partial(
-        _read,
-        name=name,
-        ego=ego,
-        topic=topic,
-        fields=fields,
-        beside=beside,
-        window_s=window_s,
-        max_gap_s=max_gap_s,
-        classes=classes or {},
-    )
+
+    def read(log: Log) -> Recording:
+        return _read(log, name, ego, topic, fields, beside, window_s, max_gap_s, classes or {})
+
     if isinstance(source, Log):
         return read(source)
     place, stamps = Path(source) if isinstance(source, str) else source, None
@@ -167,7 +160,6 @@ def read_log(
 @np.errstate(over="ignore", invalid="ignore")  # a state that is not finite is left out later, with a note
 def _read(
     log: Log,
-    *,
     name: str,
     ego: str | EgoTopic | None,
     topic: str | None,
@@ -179,16 +171,12 @@ def _read(
 ) -> Recording:
     asked = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, beside, fields, asked)
-    try:
-        log = cut_window(log, topic, window_s, max_gap_s)
-        columns, around, world = _decode_world(
-            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
-        )
-    except BrokenIndexError as error:
-        log = cut_window(log.from_start(error), topic, window_s, max_gap_s)
-        columns, around, world = _decode_world(
-            log, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s
-        )
+
+    def decode(log: Log) -> tuple[Log, tuple[DecodedObjects, LogContext | None, str]]:
+        cut = cut_window(log, topic, window_s, max_gap_s)
+        return cut, _decode_world(cut, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s)
+
+    log, (columns, around, world) = log.attempt(decode)
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     try:
         scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)

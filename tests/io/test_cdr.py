@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.encodings.cdr import CdrDefinition
 from copem_replay.io.encodings.columns import (
-    DefinitionError,
     ShreddedMessages,
     ancestor_rows,
     list_level,

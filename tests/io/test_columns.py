@@ -13,9 +13,9 @@ from google.protobuf import descriptor_pb2, descriptor_pool, json_format, messag
 from hypothesis import given
 from hypothesis import strategies as st
 
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.encodings.columns import (
     Definition,
-    DefinitionError,
     LevelRows,
     ShreddedMessages,
     ancestor_rows,

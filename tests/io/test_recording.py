@@ -2,24 +2,18 @@
 
 import json
 import math
-import struct
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from osi3.osi_sensorview_pb2 import SensorView
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import CLASSES, TRUTH, VALUES
-from copem_replay.io.decoded_size import DecodeAllowance
-from copem_replay.io.ground_truth import DecodedObjects
 from copem_replay.io.recording import Recording, read_log
-from copem_replay.io.schemas import osi_ground_truth
 from copem_replay.pipeline.notes import scene_as_json, scene_from_json
 from tests.helpers.recordings import (
     ANIMAL,
@@ -41,14 +35,8 @@ from tests.helpers.recordings import (
 ONE_CAR = [(0.0, [Obj(x=0.0, vx=10.0)]), (0.1, [Obj(x=1.0, vx=10.0)])]
 
 
-@pytest.fixture(params=["object by object", "each message walked through", "several at once"])
-def path(tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Of a recording, which is read in each of the ways in which small and large ones are."""
-    if request.param != "object by object":
-        import copem_replay.io.encodings.protobuf  # noqa: F401  where Numba is there, many messages are walked through
-
-        at_once = 0 if request.param == "each message walked through" else 250
-        monkeypatch.setattr(osi_ground_truth, "BATCH_BYTES", at_once)
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
     return tmp_path / "log.mcap"
 
 
@@ -388,50 +376,6 @@ def test_enum_values_that_do_not_exist(path):
     thing.MergeFromString(bytes([3 << 3, 77]))
     write_mcap(path, [Topic("truth", "osi3.GroundTruth", [(0, message.SerializeToString())])])
     assert classes(read_log(path, name="log")) == {"1": "pedestrian", "2": "vehicle", "3": "other"}
-
-
-def field(number: int, content: bytes) -> bytes:
-    """A field of protobuf whose value is a text or a message."""
-    return bytes([number << 3 | 2, len(content)]) + content
-
-
-def double(number: int, value: float) -> bytes:
-    return bytes([number << 3 | 1]) + struct.pack("<d", value)
-
-
-POSITION = double(1, 3.0) + double(2, -4.0)
-PIECES = [
-    field(1, b"\x08\x07"), field(1, b"\x08\x00"), field(1, b""), field(1, b"\x09" + bytes(8)),  # id, a double for one
-    field(2, field(2, POSITION)), field(2, field(2, b"")), field(2, field(2, double(3, 1.0))),  # base: position
-    field(2, field(3, double(3, 0.5))), field(2, field(3, b"")), field(2, field(4, double(1, 2.0))), field(2, b""),
-    field(2, field(1, double(1, 4.5) + double(2, 1.8) + double(3, 1.5)) + field(4, b"")),
-    b"\x13" + field(2, double(1, 99.0)) + b"\x14",  # a group where base should be
-    b"\x18\x03", b"\x18\x02", b"\x18\x63", b"\x1d" + bytes(4), b"\x1a\x01\x04",  # type, of other wire types, too
-    field(6, b"\x08\x06"), field(6, b"\x08\x63"), field(6, b""), field(6, b"\x08\x83\x80\x80\x80\x80\x01"),
-    field(15, b"\x08\x01"),  # of no number that there is
-]  # fmt: skip
-"""Fields of osi3.MovingObject as no writer orders them: the last of several counts, and messages are merged."""
-
-
-@given(st.lists(st.lists(st.lists(st.sampled_from(PIECES), max_size=8), max_size=4), min_size=1, max_size=4))
-def test_messages_walked_through_are_those_read_object_by_object(messages):
-    def decoded(at_once: int) -> DecodedObjects:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(osi_ground_truth, "BATCH_BYTES", at_once)
-            decoder = osi_ground_truth.GroundTruthDecoder(DecodeAllowance(0))
-            for k, objects in enumerate(messages):
-                lists = (field(5 - k % 2, b"".join(pieces)) for k, pieces in enumerate(objects))
-                decoder.add(b"".join(lists), schema="osi3.GroundTruth", log_time_ns=k)
-            return decoder.columns()
-
-    import copem_replay.io.encodings.protobuf  # noqa: F401
-
-    plain, walked = decoded(1_000_000), decoded(40)
-    for name in ("stamp_ns", "rows", "class_ix", "values"):
-        np.testing.assert_array_equal(getattr(walked, name), getattr(plain, name))
-    named = [[(of.object_ids[k], bool(of.moving[k])) for k in of.object_ix] for of in (plain, walked)]
-    assert named[0] == named[1]
-    assert walked.notes == plain.notes
 
 
 def test_class_is_the_most_frequent_and_of_equals_the_first(path):

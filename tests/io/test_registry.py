@@ -10,11 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from copem_replay.io import open as containers
-from copem_replay.io.log import open_mcap
-from copem_replay.io.open import CONTAINERS, Container
-from copem_replay.io.recording import read_log
-from tests.io.test_world_frame import fields, own_recording
+from tests.io.test_world_frame import own_recording
 
 MODULE = """
 from copem_replay.io.schemas.description import Description, Fields
@@ -110,14 +106,3 @@ def test_a_row_that_is_none_is_one_line(tmp_path: Path, row: str, expected: str)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(expected)
-
-
-def test_a_container_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that holds its recording behind its own name: `a.link` has the path of an MCAP file in it."""
-    path = tmp_path / "a.link"
-    path.write_text(str(own_recording(tmp_path)))
-    link = Container("link", lambda p: p.suffix == ".link", lambda p: open_mcap(Path(p.read_text())))
-    monkeypatch.setattr(containers, "CONTAINERS", (link, *CONTAINERS))
-    found = read_log(path, name="a", topic="/boxes", fields=fields())
-    assert sorted(found.scene.object_ids) == ["7", "8"]
-    assert found.path == tmp_path / "a.mcap"

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
 from pandas.testing import assert_frame_equal
 from typer.testing import CliRunner
 
@@ -23,6 +25,7 @@ from copem_replay.io.open import DriveRecordings, label_files, open_log
 from copem_replay.io.recorded_lists import read_recorded
 from copem_replay.io.recording import read_log
 from copem_replay.io.window import Window
+from copem_replay.io.write.source import open_source
 from tests.experiment.test_validate import against_logs, without_logs
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, Topic, ns, truth_topic, write_mcap
@@ -343,3 +346,20 @@ def cubes(t_s: float) -> dict[str, Any]:
     metadata = [{"key": "category", "value": "vehicle.car"}]
     entity = {"id": "c1", "timestamp": at, "frame_id": "lidar", "cubes": [cube], "metadata": metadata}
     return {"deletions": [], "entities": [entity]}
+
+
+def test_both_files_are_hit(folder: Path) -> None:
+    """Neither index can be used: what is left of both is read, and copied in order of time."""
+    for name, topics in (("ego.mcap", ego_topics()), ("rsu.mcap", [rsu(AHEAD_S)])):
+        write_mcap(folder / name, topics, chunk_size=1, compression=CompressionType.NONE)
+        data = bytearray((folder / name).read_bytes())
+        with (folder / name).open("rb") as file:
+            chunk = make_reader(file).get_summary().chunk_indexes[-1]  # type: ignore[union-attr]
+        data[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 0x10
+        (folder / name).write_bytes(data)
+    source = open_source(place(folder))
+    copied = list(source.messages({number: number for number in source.channels}))
+    assert len(copied) == 40 + 20 + 38 - 2
+    assert [m.log_time for m in copied] == sorted(m.log_time for m in copied)
+    assert source.damage == "damaged: its messages are copied as far as they can be read"
+    assert len(read_recorded(place(folder), "rsu:objects", read_log(place(folder), name="drive").scene).logged_ns) == 37

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,13 +18,15 @@ from copem_replay.core.object_list import ENTRY
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, VALUES, Int, Scene, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.io.encodings import column_bytes as list_blocks
-from copem_replay.io.write import scene as foxglove_scene
+from copem_replay.io.encodings.cdr_bytes import encode_cdr
+from copem_replay.io.encodings.column_bytes import encode_messages
 from copem_replay.io.write.detail import DetailWriter, Statuses, StatusWriter
 from copem_replay.io.write.osi import SensorDataWriter
 from copem_replay.io.write.ros2 import DetectedObjectsWriter
-from copem_replay.io.write.scene import FoxgloveSceneWriter, UncertaintyWriter, principal_axes
+from copem_replay.io.write.scene import BoxWriter, Draw, UncertaintyWriter, draw_scenes, principal_axes
 from tests.oracles import messages as plain
 
+SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
 T0_NS = 1_700_000_000_123_456_789
 UNITS = 20
 COLOUR = (255, 0, 77)
@@ -98,6 +102,21 @@ def same(found: Iterable[bytes], fused_tracks: FusedTracks, expected: Callable[[
     assert list(found) == [expected(frame, time_ns) for frame, time_ns in enumerate(available_ns)]
 
 
+def same_scenes(
+    made: Callable[[Draw], Iterable[bytes]],
+    fused_tracks: FusedTracks,
+    expected: Callable[[int, int], bytes],
+    frame_id: str,
+) -> None:
+    """In protobuf the bytes of its library, in ROS 2 messages of the same content."""
+    in_protobuf = list(made(partial(draw_scenes, partial(encode_messages, SceneUpdate.DESCRIPTOR), frame_id)))
+    same(in_protobuf, fused_tracks, expected)
+    in_ros2 = made(partial(draw_scenes, partial(encode_cdr, SCENE_UPDATE), frame_id))
+    for one, other in zip(in_protobuf, in_ros2, strict=True):
+        theirs = plain.content_of(plain.decode_ros2(SCENE_UPDATE, other), SceneUpdate.DESCRIPTOR)
+        assert theirs == plain.content_of(SceneUpdate.FromString(one), SceneUpdate.DESCRIPTOR)
+
+
 @pytest.fixture(params=[3, 20_000], autouse=True, scope="module")
 def _block(request: pytest.FixtureRequest) -> Iterable[None]:
     with pytest.MonkeyPatch.context() as patched:
@@ -124,7 +143,7 @@ def test_entries_about_no_object_move_in_messages_of_ros() -> None:
     )
     still, moves = (replace(SCENE, moving=np.append(SCENE.moving[:-1], last)) for last in (False, True))
     of_both = [DetectedObjectsWriter(scene, fused_tracks, "map") for scene in (still, moves)]
-    messages = [[writer.message(frame, 10**9) for frame in range(4)] for writer in of_both]
+    messages = [list(writer.messages(np.full(4, 10**9))) for writer in of_both]
     assert max(map(len, messages[0])) > 500
     assert messages[0] == messages[1]
 
@@ -132,11 +151,11 @@ def test_entries_about_no_object_move_in_messages_of_ros() -> None:
 @given(LISTS, st.sampled_from(["global", ""]))
 @settings(deadline=None)
 def test_scene_updates(fused_tracks: FusedTracks, frame_id: str) -> None:
-    writer = FoxgloveSceneWriter(SCENE, fused_tracks, "gnn", COLOUR, frame_id)
-    same(
-        writer.messages(available_of(fused_tracks)),
+    same_scenes(
+        lambda draw: BoxWriter(SCENE, fused_tracks, "gnn", COLOUR, draw).messages(available_of(fused_tracks)),
         fused_tracks,
         lambda frame, time_ns: plain.scene_update(SCENE, fused_tracks, "gnn", COLOUR, frame_id, frame, time_ns),
+        frame_id,
     )
 
 
@@ -146,13 +165,11 @@ def test_ellipses(fused_tracks: FusedTracks) -> None:
     fused = fused_tracks.fused
     none = np.zeros(len(fused.frame_ix))
     of = principal_axes(*(none if c is None else c[0] for c in (fused.cov_ee_m2, fused.cov_en_m2, fused.cov_nn_m2)))
-    writer = UncertaintyWriter(
-        SCENE, fused_tracks, COLOUR, lambda *what: foxglove_scene.encode_ellipses(*what, frame_id="map")
-    )
-    same(
-        writer.messages(available_of(fused_tracks)),
+    same_scenes(
+        lambda draw: UncertaintyWriter(SCENE, fused_tracks, COLOUR, draw).messages(available_of(fused_tracks)),
         fused_tracks,
         lambda frame, time_ns: plain.ellipses(SCENE, fused_tracks, COLOUR, "map", of, frame, time_ns),
+        "map",
     )
 
 

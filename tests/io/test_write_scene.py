@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,28 +19,26 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import copem_replay as cr
+from copem_replay.io.encodings.cdr_bytes import encode_cdr
+from copem_replay.io.encodings.column_bytes import encode_messages
 from copem_replay.io.encodings.ros2_types import message_definition
 from copem_replay.io.recording import read_log
-from copem_replay.io.write import ros2 as foxglove_scene_ros2
-from copem_replay.io.write import scene as foxglove_scene
 from copem_replay.io.write.detail import KNOWN, LISTED, NOT_LISTED
-from copem_replay.io.write.message_family import STATUS, TRANSFORM
-from copem_replay.io.write.ros2 import SCENE_UPDATE
 from copem_replay.io.write.scene import (
+    Draw,
     Ellipse,
     Entity,
     Line,
     MovingEntities,
     Pose,
     Text,
-    encode_moving,
+    draw_moving,
+    draw_scenes,
     principal_axes,
+    transform_content,
 )
 from tests.helpers.experiments import changed, drive
-
-mcap_ros2 = pytest.importorskip(
-    "mcap_ros2._dynamic", reason="needs mcap-ros2-support, which `pip install .[dev]` brings"
-)
+from tests.oracles import messages as plain
 
 GREY = (0.5, 0.5, 0.5, 1.0)
 DRAWN = [
@@ -232,28 +231,23 @@ class TestUncertainty:
         assert all(not SceneUpdate.FromString(data).entities for _, data in truth)
 
 
-def test_both_families_draw_the_same() -> None:
-    ours = SceneUpdate.FromString(foxglove_scene.encode_scene(DRAWN, 1_500_000_000, "map"))
-    decode = mcap_ros2.generate_dynamic(SCENE_UPDATE, message_definition(SCENE_UPDATE).decode())[SCENE_UPDATE]
-    theirs = decode(foxglove_scene_ros2.encode_ros2_scene(DRAWN, 1_500_000_000, "map"))
-    assert [e.id for e in theirs.entities] == ["odd", "nothing", "text alone"]
-    for one, other in zip(ours.entities, theirs.entities, strict=True):
-        assert (other.timestamp.sec, other.timestamp.nanosec, other.frame_id) == (1, 500_000_000, "map")
-        assert [(m.key, m.value) for m in one.metadata] == [(m.key, m.value) for m in other.metadata]
-        for kind in ("cylinders", "lines", "texts"):
-            pairs = list(zip(getattr(one, kind), getattr(other, kind), strict=True))
-            for a, b in pairs:
-                for name in ("position", "orientation"):
-                    for axis in "xyz":
-                        assert getattr(getattr(a.pose, name), axis) == getattr(getattr(b.pose, name), axis)
-                assert (a.color.r, a.color.a) == (b.color.r, b.color.a)
-        assert [(p.x, p.y, p.z) for line in one.lines for p in line.points] == [
-            (p.x, p.y, p.z) for line in other.lines for p in line.points
-        ]
-        assert [text.text for text in one.texts] == [text.text for text in other.texts]
-        assert [(c.size.x, c.size.y, c.size.z, c.top_scale) for c in one.cylinders] == [
-            (c.size.x, c.size.y, c.size.z, c.top_scale) for c in other.cylinders
-        ]
+SCENE_UPDATE, TRANSFORM = "foxglove_msgs/msg/SceneUpdate", "foxglove_msgs/msg/FrameTransform"
+IN_PROTOBUF: Draw = partial(draw_scenes, partial(encode_messages, SceneUpdate.DESCRIPTOR), "map")
+IN_ROS2: Draw = partial(draw_scenes, partial(encode_cdr, SCENE_UPDATE), "map")
+
+
+def same_scenes(moving: MovingEntities, frames: list[list[Entity]]) -> None:
+    """In protobuf the bytes of its library, in ROS 2 messages of the same content."""
+    expected = [plain.drawn_scene(each, "map", ns) for each, ns in zip(frames, moving.time_ns.tolist(), strict=True)]
+    assert list(draw_moving(moving, IN_PROTOBUF)) == expected
+    decoded = [plain.decode_ros2(SCENE_UPDATE, data) for data in draw_moving(moving, IN_ROS2)]
+    found = [plain.content_of(message, SceneUpdate.DESCRIPTOR) for message in decoded]
+    assert found == [plain.content_of(SceneUpdate.FromString(data), SceneUpdate.DESCRIPTOR) for data in expected]
+
+
+def test_entities_once() -> None:
+    for entities in (DRAWN, [DRAWN[1]], []):
+        same_scenes(MovingEntities.at(1_500_000_000, entities), [entities])
 
 
 def test_moving_entities_are_the_messages_of_each_frame_alone() -> None:
@@ -267,24 +261,29 @@ def test_moving_entities_are_the_messages_of_each_frame_alone() -> None:
         ))
     )  # fmt: skip
     frames = [[0], [], [1, 2, 3], [4]]
-    expected, expected_ros2 = [], []
-    for at_ns, rows in zip(moving.time_ns.tolist(), frames, strict=True):
-        columns = moving.x_m, moving.y_m, moving.z_m, moving.yaw_rad
-        drawn = [looks[look_ix[r]].placed(Pose(*(float(column[r]) for column in columns))) for r in rows]
-        expected.append(foxglove_scene.encode_scene(drawn, at_ns, "map"))
-        expected_ros2.append(foxglove_scene_ros2.encode_ros2_scene(drawn, at_ns, "map"))
-    assert list(encode_moving(moving, "map")) == expected
-    assert list(foxglove_scene_ros2.encode_ros2_moving(moving, "map")) == expected_ros2
+    columns = moving.x_m, moving.y_m, moving.z_m, moving.yaw_rad
+    same_scenes(
+        moving,
+        [[looks[look_ix[r]].placed(Pose(*(float(c[r]) for c in columns))) for r in rows] for rows in frames],
+    )
 
 
 def test_both_families_place_a_frame_alike() -> None:
-    pose = Pose(1.0, 2.0, 3.0, math.pi / 3)
-    ours = FrameTransform.FromString(foxglove_scene.encode_transform("map", pose, 2_000_000_001, "copem_ego"))
-    decode = mcap_ros2.generate_dynamic(TRANSFORM, message_definition(TRANSFORM).decode())[TRANSFORM]
-    theirs = decode(foxglove_scene_ros2.encode_ros2_transform("map", pose, 2_000_000_001, "copem_ego"))
-    for found in (ours, theirs):
-        assert (found.parent_frame_id, found.child_frame_id) == ("map", "copem_ego")
-        assert (found.translation.x, found.translation.y, found.translation.z) == (1.0, 2.0, 3.0)
-        assert (found.rotation.x, found.rotation.z, found.rotation.w) == pytest.approx((0, 0.5, math.sqrt(0.75)))
-    assert (ours.timestamp.seconds, ours.timestamp.nanos) == (theirs.timestamp.sec, theirs.timestamp.nanosec) == (2, 1)
-    assert "string status" in message_definition(STATUS).decode()
+    poses = [Pose(1.0, 2.0, 3.0, math.pi / 3), Pose()]
+    content = transform_content("map", "copem_ego", poses, np.array([2_000_000_001, -1]))
+    ours = [FrameTransform.FromString(data) for data in encode_messages(FrameTransform.DESCRIPTOR, content, 2)]
+    theirs = [plain.decode_ros2(TRANSFORM, data) for data in encode_cdr(TRANSFORM, content, 2)]
+    for one, other in zip(ours, theirs, strict=True):
+        assert plain.content_of(one, FrameTransform.DESCRIPTOR) == plain.content_of(other, FrameTransform.DESCRIPTOR)
+    first, last = ours
+    assert (first.parent_frame_id, first.child_frame_id) == ("map", "copem_ego")
+    assert (first.translation.x, first.translation.y, first.translation.z) == (1.0, 2.0, 3.0)
+    assert (first.rotation.x, first.rotation.z, first.rotation.w) == pytest.approx((0, 0.5, math.sqrt(0.75)))
+    assert (first.timestamp.seconds, first.timestamp.nanos) == (2, 1)
+    assert (last.rotation.z, last.rotation.w, last.timestamp.seconds) == (0, 1, -1)
+    with pytest.raises(KeyError, match="foxglove_msgs/FrameTransform has no child"):
+        encode_cdr(TRANSFORM, {"child": 1.0}, 1)
+
+
+def test_statuses_of_ros_have_their_words() -> None:
+    assert "string status" in message_definition("copem_replay_msgs/msg/Status").decode()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ import orjson
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from osi3.osi_sensordata_pb2 import SensorData
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, UNCERTAINTIES, Scene
+from copem_replay.io.encodings.ros2_types import message_definition
 from copem_replay.io.schemas.osi_ground_truth import osi_id
+from copem_replay.io.write.scene import Entity, Pose
 
 OSI_TYPE: dict[str, tuple[int, int | None]] = {
     "pedestrian": (3, None), "animal": (4, None), "other": (1, None), "vehicle": (2, 0), "car": (2, 4), "van": (2, 6),
@@ -159,6 +163,68 @@ def ellipses(
         made.color.r, made.color.g, made.color.b = (c / 255 for c in colour)
         made.color.a = 0.6 + (0.15 - 0.6) * min(age_s, 1.0)
     return bytes(update.SerializeToString(deterministic=True))
+
+
+def drawn_scene(entities: Sequence[Entity], frame_id: str, available_ns: int) -> bytes:
+    """foxglove.SceneUpdate: entities at their poses."""
+    update = _update(available_ns)
+    for each in entities:
+        entity = update.entities.add(frame_id=frame_id, id=each.name)
+        entity.timestamp.FromNanoseconds(available_ns)
+        for key, value in each.says.items():
+            entity.metadata.add(key=key, value=value)
+        for ellipse in each.ellipses:
+            made = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
+            made.size.x, made.size.y, made.size.z = ellipse.size
+            _place(made, each.pose, ellipse.colour)
+        for line in each.lines:
+            made = entity.lines.add(thickness=line.width, scale_invariant=True)
+            for x, y, z in line.points:
+                made.points.add(x=x, y=y, z=z)
+            _place(made, each.pose, line.colour)
+        for text in each.texts:
+            made = entity.texts.add(billboard=True, font_size=text.size, scale_invariant=True, text=text.text)
+            over = Pose(each.pose.x_m, each.pose.y_m, sum(text.above_m, start=each.pose.z_m))
+            _place(made, over, text.colour)
+    return bytes(update.SerializeToString(deterministic=True))
+
+
+def _place(primitive: Any, pose: Pose, colour: Sequence[float]) -> None:
+    at, turn, shade = primitive.pose.position, primitive.pose.orientation, primitive.color
+    at.x, at.y, at.z = pose.x_m, pose.y_m, pose.z_m
+    turn.z, turn.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    shade.r, shade.g, shade.b, shade.a = colour
+
+
+def content_of(message: Any, descriptor: Any) -> dict[str, Any]:
+    """What all fields of a type in protobuf are in a message of it, or in one of the same fields in ROS 2."""
+    found: dict[str, Any] = {}
+    for field in descriptor.fields:
+        value, inner = getattr(message, field.name), field.message_type
+        if inner is not None and inner.full_name in ("google.protobuf.Timestamp", "google.protobuf.Duration"):
+            names = ("seconds", "nanos") if hasattr(value, "seconds") else ("sec", "nanosec")
+            found[field.name] = tuple(int(getattr(value, name)) for name in names)
+        elif inner is not None:
+            found[field.name] = (
+                [content_of(item, inner) for item in value] if field.is_repeated else content_of(value, inner)
+            )
+        else:
+            found[field.name] = list(value) if field.is_repeated or isinstance(value, bytes | np.ndarray) else value
+    return found
+
+
+@cache
+def _store(name: str) -> Any:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(message_definition(name).decode(), name))
+    return store
+
+
+def decode_ros2(name: str, data: bytes) -> Any:
+    """A message of ROS 2 as rosbags reads it, which has to write the same bytes."""
+    found = _store(name).deserialize_cdr(data, name)
+    assert bytes(_store(name).serialize_cdr(found, name)) == data
+    return found
 
 
 def detail(

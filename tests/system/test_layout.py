@@ -23,8 +23,8 @@ FLOORS = (
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
 MOST_LINES = {
-    "core": 5_800, "io": 12_400, "perception": 3_900, "communication": 1_300, "fusion": 4_400, "metrics": 10_300,
-    "experiment": 5_100, "pipeline": 5_900, "results": 7_100, "viewer": 6_000, "report": 5_500, "api": 1_200,
+    "core": 5_800, "io": 11_800, "perception": 3_900, "communication": 1_300, "fusion": 4_400, "metrics": 10_300,
+    "experiment": 5_100, "pipeline": 5_900, "results": 7_200, "viewer": 6_000, "report": 5_500, "api": 1_200,
     "cli": 1_400, "extras": 16_200,
 }  # fmt: skip
 """Of a wing. A change that needs more takes something away, or a decision raises the row."""

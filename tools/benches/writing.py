@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from benches import common
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
+from copem_replay.io.encodings.column_bytes import encode_messages
 from copem_replay.io.write.detail import DetailWriter
 from copem_replay.io.write.mcap import write_mcap
 from copem_replay.io.write.osi import SensorDataWriter
-from copem_replay.io.write.scene import FoxgloveSceneWriter
+from copem_replay.io.write.scene import FRAME_ID, BoxWriter, Draw, draw_scenes
 from copem_replay.metrics.summary import settle_horizon, summarise_rows
 from copem_replay.pipeline.one_run import ReplayedRun, RunTracks
 from copem_replay.pipeline.prepare import prepare_log
@@ -29,13 +32,14 @@ def encoding(scene: Scene, all_tracks: dict[str, FusedTracks], compared: str) ->
     """Objects per second into the messages of the three channels; and how much faster than the libraries on one."""
 
     def ours(chosen: dict[str, FusedTracks]) -> list[bytes]:
-        made = []
+        made: list[bytes] = []
+        draw: Draw = partial(draw_scenes, partial(encode_messages, SceneUpdate.DESCRIPTOR), FRAME_ID)
         for name, of in chosen.items():
             available_ns = scene.t0_ns + np.rint(of.fused.arrives_s[0] * 1e9).astype(np.int64)
             numbers = {unit: k + 1 for k, unit in enumerate(of.received.units)}
             writers = (
                 SensorDataWriter(scene, of, numbers),
-                FoxgloveSceneWriter(scene, of, name, _GREY),
+                BoxWriter(scene, of, name, _GREY, draw),
                 DetailWriter(scene, of, {}),
             )
             made += [message for writer in writers for message in writer.messages(available_ns)]

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.experiment.draft.findings import ProposalFound
-from copem_replay.io.channel import Channel
+from copem_replay.io.channel import Channel, DefinitionError
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError, list_level, list_levels, shred_messages
+from copem_replay.io.encodings.columns import list_level, list_levels, shred_messages
 from copem_replay.io.log import BrokenIndexError, Log
 from copem_replay.io.recording import Recording, foreign_channels, read_log
 from copem_replay.io.schemas.description import Fields

@@ -250,7 +250,7 @@ def _find_poses(log: Log) -> list[dict[str, str]]:
     """Values of `ego` for the topics that may have its poses: odometry first, transforms last."""
     if not foreign_channels(log):
         return []
-    from copem_replay.io.encodings.columns import DefinitionError
+    from copem_replay.io.channel import DefinitionError
     from copem_replay.io.log import gather_messages
     from copem_replay.io.schemas.poses import decode_poses
 

@@ -16,9 +16,9 @@ import numpy as np
 from copem_replay.core.errors import RecordingError
 from copem_replay.core.frame import Frame, make_local_proj
 from copem_replay.core.tracks import Float, Int
-from copem_replay.io.channel import ENCODINGS, LAST_NS, Channel, schema_name
+from copem_replay.io.channel import ENCODINGS, LAST_NS, Channel, DefinitionError, schema_name
 from copem_replay.io.encodings import make_definition
-from copem_replay.io.encodings.columns import DefinitionError, list_level, shred_messages
+from copem_replay.io.encodings.columns import list_level, shred_messages
 from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.recording import Recording
 

@@ -65,7 +65,7 @@ class TraceLog(Log):
     lengths: Sequence[int] = field(default=(), repr=False)
     times_ns: Sequence[int] = field(default=(), repr=False)
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages in order of their time stamps, if the one channel is asked for."""
         with open_file(self.path) as file:
             for number, (first_ns, last_ns) in self.spans(numbers).items():

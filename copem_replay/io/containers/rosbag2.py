@@ -1,8 +1,8 @@
 """A rosbag2 folder as one recording: the MCAP files that its `metadata.yaml` names, in order of log time.
 
-Channels of several files that agree in topic, schema and encoding are one. A file is opened when its first message is
-due, and closed after its last one. A damaged file is read as far as it goes; of several files, one that cannot be read
-at all is left out with a note.
+Channels of several files that agree in topic, schema, encoding and metadata are one. A file is opened when its first
+message is due, and closed after its last one. A damaged file is read as far as it goes; of several files, one that
+cannot be read at all is left out with a note.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from mcap.records import Message
@@ -158,7 +159,7 @@ class BagLog(Log):
     parts: tuple[BagFile, ...] = ()
     lost: tuple[str, ...] = ()  # files that cannot be read at all, and why
 
-    def messages(self, numbers: Set[int]) -> Iterator[Message]:
+    def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
         """Messages of some channels in order of log time, of equal ones in the order of the files.
 
         Raises BrokenIndexError.
@@ -168,7 +169,7 @@ class BagLog(Log):
             numbers_in_log = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
             filled = {c.number for c in part.log.channels if c.number in numbers_in_log and c.messages}
             if has_overlap(part.log.spans(filled).values(), part.log.start_ns, part.log.end_ns):
-                streams.append((part.log.start_ns, _RenumberedFile(part.log, numbers_in_log).__iter__))
+                streams.append((part.log.start_ns, partial(_read_renumbered, part.log, numbers_in_log, sort)))
         yield from merge_streams(streams)
 
     def file_bytes(self) -> int:
@@ -193,14 +194,8 @@ class BagLog(Log):
         return _join_bag_files(self.path, logs, lost, self.notes).within(self.window)
 
 
-@dataclass(frozen=True)
-class _RenumberedFile:
-    log: Log
-    numbers: Mapping[int, int]
-
-    def __iter__(self) -> Iterator[Message]:
-        for message in self.log.messages(self.numbers.keys()):
-            yield renumber_message(message, self.numbers)
+def _read_renumbered(log: Log, numbers: Mapping[int, int], sort: bool) -> Iterator[Message]:
+    return (renumber_message(message, numbers) for message in log.messages(numbers.keys(), sort=sort))
 
 
 def open_bag(folder: Path) -> BagLog:
@@ -227,7 +222,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], note
     for log in logs:
         numbers_of_log = {}
         for c in log.channels:
-            key = (c.topic, c.schema, c.encoding, c.schema_encoding, c.schema_data)
+            key = (c.topic, c.schema, c.encoding, c.schema_encoding, c.schema_data, tuple(sorted(c.metadata.items())))
             number = numbers_of_log[c.number] = numbers.setdefault(key, len(numbers) + 1)
             channels[number] = _merge_channels(channels[number], c) if number in channels else replace(c, number=number)
         parts.append(BagFile(log, numbers_of_log))

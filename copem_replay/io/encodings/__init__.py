@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 def make_definition(channel: Channel, samples: Sequence[bytes]) -> Definition:
     """The definition of a channel's messages; JSON has no other than `samples`. Raises DefinitionError."""
     # Loaded where one is needed: most recordings have one encoding, and two of them bring Numba.
+    from copem_replay.io.channel import DefinitionError
     from copem_replay.io.encodings.cdr import CdrDefinition
-    from copem_replay.io.encodings.columns import DefinitionError
     from copem_replay.io.encodings.json import JsonDefinition
     from copem_replay.io.encodings.protobuf import ProtobufDefinition
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,20 +19,15 @@ from numpy.typing import NDArray
 
 from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
-from copem_replay.io.decoded_size import check_decoded_bytes
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.encodings.columns import (
-    COLUMN_BYTES,
     Definition,
-    DefinitionError,
-    RawColumn,
     ShreddedMessages,
     ValueKind,
-    join_arrays,
     list_level,
     list_levels,
-    parent_level,
-    shred_columns,
     split_batches,
+    walk_columns,
 )
 from copem_replay.io.encodings.ros2_types import known_types
 
@@ -65,22 +59,9 @@ def _read_number(data: NDArray[np.uint8], offset: int, size: int, swapped: bool)
 
 @kernel
 def walk_cdr(
-    data: NDArray[np.uint8],
-    bounds: Int,
-    program: Int,
-    first: Int,
-    room: Int,
-    bits: Any,
-    lengths: Int,
-    parent: Int,
-    decoded: Bool,
+    data: NDArray[np.uint8], bounds: Int, program: Int, first: Int, room: Int, bits: Any, lengths: Int, parent: Int
 ) -> Int:
-    """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
-
-    Message m is `data[bounds[m]:bounds[m + 1]]`. The value of column c in row r of its level goes to
-    `bits[first[c] + r]`; of a text that is its begin, and `lengths` has its length. `parent[l, r]` is the parent of row
-    r of level l; level 0 is the message. A message that does not fit its schema is not `decoded` and leaves no rows.
-    """
+    """As `Walk`, of values that are all there. A message that does not fit its schema leaves no rows."""
     rows = np.zeros(len(room), dtype=np.int64)
     before = np.zeros(len(room), dtype=np.int64)
     back = np.zeros(DEEPEST, dtype=np.int64)  # instruction after the head of each list that is open
@@ -187,7 +168,6 @@ def walk_cdr(
                                     break
                             parent[level, rows[level] - 1] = rows[inner] - 1
                     depth += 1
-        decoded[m] = good
         if not good:
             rows[:] = before
     return rows
@@ -375,30 +355,20 @@ class CdrDefinition(Definition):
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
         """The columns of messages. Raises KeyError for a path that is neither offered nor picked; OversizeError."""
         wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
-        levels = list_levels(wanted)
-        builder = CdrProgram(self._types, wanted, levels)
+        builder = CdrProgram(self._types, wanted, list_levels(wanted))
         builder.add_type(self._name, "")
         program = builder.finished()
-        level_ix = np.array([levels.index(list_level(path)) for path in wanted], dtype=np.int64)
-        columns = [RawColumn(builder.kinds[path]) for path in wanted]
-        rows = np.zeros(len(levels), dtype=np.int64)
-        parents: list[list[Int]] = [[] for _ in levels]
-        decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in split_batches(payloads):
-            data = b"".join(payloads[batch])
-            bounds = np.cumsum([0, *map(len, payloads[batch])], dtype=np.int64)
-            batch_rows, bits, lengths, parent = _walk_batch(
-                data, bounds, program, level_ix, decoded[batch], len(levels)
-            )
-            for k, name in enumerate(levels):
-                up = batch.start if not name else rows[levels.index(parent_level(name))]
-                parents[k].append(parent[k, : batch_rows[k]] + up)
-            for column, b, n in zip(columns, bits, lengths, strict=True):
-                column.add(data, b, n)
-            rows += batch_rows
+        kinds = {path: builder.kinds[path] for path in wanted}
 
-        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(levels)}
-        return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
+        def walk(
+            data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, said: Bool,
+            parent: Int,
+        ) -> Int:  # fmt: skip
+            said[:] = True
+            return walk_cdr(data, bounds, program, first, room, bits, lengths, parent)
+
+        batches = ((np.arange(batch.start, batch.stop), payloads[batch]) for batch in split_batches(payloads))
+        return walk_columns(walk, batches, kinds, numbers, texts, len(payloads))
 
     def _explore(self, name: str, path: str, inside: tuple[str, ...]) -> None:
         """Add all leaves below a type to the offered ones. Raises DefinitionError: nested without end, or too many."""
@@ -425,23 +395,6 @@ class CdrDefinition(Definition):
             if item[0] == BASE and item[1][0] in BASES and kind == FIXED_ARRAY:
                 self._arrays[path] = number
             self._explore_node(item, f"{path}[]", inside)
-
-
-def _walk_batch(
-    data: bytes, bounds: Int, program: Int, level_ix: Int, decoded: Bool, levels: int
-) -> tuple[Int, list[Any], list[Int], Int]:
-    """Number of rows of each level; bits and lengths of each column; parents (levels, most rows)."""
-    octets = np.frombuffer(data, dtype=np.uint8)
-    first = np.zeros(len(level_ix) + 1, dtype=np.int64)
-    none = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.int64), np.zeros((levels, 0), dtype=np.int64)
-    rows = walk_cdr(octets, bounds, program, first, np.zeros(levels, dtype=np.int64), *none, decoded)
-    np.cumsum(rows[level_ix], out=first[1:])
-    check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * int(rows.max(initial=0)))
-    bits, lengths = np.empty(first[-1], dtype=np.uint64), np.empty(first[-1], dtype=np.int64)
-    parent = np.empty((levels, int(rows.max(initial=0))), dtype=np.int64)
-    walk_cdr(octets, bounds, program, first, rows, bits, lengths, parent, decoded)
-    parts = [slice(*ends) for ends in pairwise(first.tolist())]
-    return rows, [bits[p] for p in parts], [lengths[p] for p in parts], parent
 
 
 _SEPARATOR = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)

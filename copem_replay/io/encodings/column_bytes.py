@@ -1,8 +1,8 @@
-"""Records encoded from columns, many at once: protobuf messages and JSON texts.
+"""Messages encoded from columns, many at once: what they hold (`Content`), protobuf, and JSON texts.
 
-First the sizes of all records are computed, then their bytes are put into one buffer. A part of a record knows its size
-in every row, `sizes` (N,), and puts its bytes at the places `offset` (N,). A record is its parts one after the other.
-Letters: N rows, M rows of a repeated part.
+Messages of ROS 2 are encoded from the same content in `cdr_bytes.py`. Of the others, first the sizes are computed, then
+their bytes are put into one buffer. A part of a record knows its size in every row, `sizes` (N,), and puts its bytes at
+the places `offset` (N,). A record is its parts one after the other. Letters: N rows, M rows of a repeated part.
 """
 
 from __future__ import annotations
@@ -71,21 +71,16 @@ def varint_sizes(values: NDArray[np.uint64]) -> Int:
 
 
 @kernel
-def put_varints(out: Bytes, offset: Int, sizes: Int, tag: Any, values: NDArray[np.uint64]) -> None:
-    """Put tags and varints at places `offset` (N,), except where the size is 0."""
-    for k in range(len(offset)):
-        if sizes[k]:
-            _put_varint(out, _put_varint(out, offset[k], tag), values[k])
-
-
-@kernel
-def put_fixed(out: Bytes, offset: Int, sizes: Int, tag: Any, bits: NDArray[np.uint64]) -> None:
-    """Put tags and eight bytes each, the lowest first, except where the size is 0."""
+def put_numbers(out: Bytes, offset: Int, sizes: Int, tag: Any, bits: NDArray[np.uint64], fixed: bool) -> None:
+    """Put tags and numbers at places `offset` (N,), as varints or eight bytes each, except where the size is 0."""
     for k in range(len(offset)):
         if sizes[k]:
             place = _put_varint(out, offset[k], tag)
-            for i in range(8):
-                out[place + i] = np.uint8((bits[k] >> np.uint64(8 * i)) & np.uint64(255))
+            if fixed:
+                for i in range(8):
+                    out[place + i] = np.uint8(bits[k] >> np.uint64(8 * i))
+            else:
+                _put_varint(out, place, bits[k])
 
 
 @kernel
@@ -116,32 +111,40 @@ class TextPool:
     """Texts to choose from: number k is `pool[first[k]:first[k] + lengths[k]]`."""
 
     def __init__(self, pool: bytes, first: Int, lengths: Int) -> None:
-        self._pool, self._first, self._lengths = np.frombuffer(pool, dtype=np.uint8), first, lengths
+        self.pool, self.first, self.lengths = np.frombuffer(pool, dtype=np.uint8), first, lengths
 
     @classmethod
-    def of(cls, texts: Sequence[bytes]) -> TextPool:
+    def of(cls, texts: Sequence[str | bytes]) -> TextPool:
         """A pool of these texts."""
-        lengths = np.fromiter(map(len, texts), dtype=np.int64, count=len(texts))
-        return cls(b"".join(texts), np.cumsum(lengths) - lengths, lengths)
+        encoded = [text.encode() if isinstance(text, str) else text for text in texts]
+        lengths = np.fromiter(map(len, encoded), dtype=np.int64, count=len(encoded))
+        return cls(b"".join(encoded), np.cumsum(lengths) - lengths, lengths)
 
     def at(self, which: Int | Bool) -> RowTexts:
         """The part that has the text `which[n]` in row n."""
-        places = np.asarray(which, dtype=np.int64)
-        return RowTexts(self._pool, self._first[places], self._lengths[places])
+        return RowTexts(self, np.asarray(which, dtype=np.int64))
+
+    @cached_property
+    def quoted(self) -> TextPool:
+        """The texts as JSON strings."""
+        whole, ends = self.pool.tobytes(), (self.first + self.lengths).tolist()
+        texts = [whole[begin:end].decode() for begin, end in zip(self.first.tolist(), ends, strict=True)]
+        return TextPool.of([orjson.dumps(text) for text in texts])
 
 
 class RowTexts:
     """A part that has a text of a pool in each row."""
 
-    def __init__(self, pool: Bytes, first: Int, lengths: Int) -> None:
-        self._pool, self._first, self.sizes = pool, first, lengths
+    def __init__(self, source: TextPool, which: Int) -> None:
+        self.source, self.which = source, which
+        self.first, self.sizes = source.first[which], source.lengths[which]
 
     def put(self, out: Bytes, offset: Int) -> None:
         """Put the bytes of every row at its place in `out`, `offset` (N,)."""
-        put_pieces(out, offset, self._pool, self._first, self.sizes)
+        put_pieces(out, offset, self.source.pool, self.first, self.sizes)
 
 
-def repeat_text(text: bytes, rows: int) -> RowTexts:
+def repeat_text(text: str | bytes, rows: int) -> RowTexts:
     """The part that has the same text in every row."""
     return TextPool.of([text]).at(np.zeros(rows, dtype=np.int64))
 
@@ -160,8 +163,7 @@ class NumberField:
 
     def put(self, out: Bytes, offset: Int) -> None:
         """Put the bytes of every row at its place in `out`, `offset` (N,)."""
-        fill = put_fixed if self._fixed else put_varints
-        fill(out, offset, self.sizes, self._tag, self._bits)
+        put_numbers(out, offset, self.sizes, self._tag, self._bits, self._fixed)
 
 
 class SizedField:
@@ -227,54 +229,59 @@ def encode_records(parts: Sequence[RecordPart], rows: int) -> list[bytes]:
     return [whole[first:last] for first, last in pairwise(cuts)]
 
 
-# JSON, as orjson writes it.
-
-_COMMA = TextPool.of([b",", b""])
+# What messages hold, in any encoding.
 
 
-def encode_texts(values: Sequence[str]) -> TextPool:
-    """A pool of texts as JSON strings."""
-    return TextPool.of([orjson.dumps(value) for value in values])
+@dataclass(frozen=True)
+class Instants:
+    """Times of any clock (N,), in ns."""
+
+    time_ns: Int
 
 
-def encode_numbers(values: NDArray[Any] | None, rows: int) -> RowTexts:
-    """The part of numbers (N,); null where one is not finite, and in all rows if `values` is None."""
-    if values is None:
-        return repeat_text(b"null", rows)
-    text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
-    commas = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord(","))
-    first = np.concatenate([[1], commas + 1])[:rows]
-    return TextPool(text, first, np.append(commas, len(text) - 1)[:rows] - first).at(np.arange(rows))
+class MessagePool:
+    """Groups of messages to choose from: group k has the rows `start[k]:start[k + 1]` of `content`."""
+
+    def __init__(self, start: Int, content: Content) -> None:
+        self.start, self.content = start, content
+        self._encoded: dict[str, TextPool] = {}
+
+    def at(self, which: Int) -> RepeatedMessages:
+        """The messages of a repeated field: in row n those of the group `which[n]`."""
+        return RepeatedMessages(self.start, self.content, which, self)
+
+    def encode(self, field: FieldDescriptor) -> TextPool:
+        """Each group as a repeated field of protobuf, encoded once."""
+        if field.full_name not in self._encoded:
+            whole = RepeatedMessages(self.start, self.content)
+            texts = encode_records([_encode_field(field, whole, len(self.start) - 1)], len(self.start) - 1)
+            self._encoded[field.full_name] = TextPool.of(texts)
+        return self._encoded[field.full_name]
 
 
-def encode_arrays(start: Int, parts: Sequence[RecordPart]) -> list[RecordPart]:
-    """The parts of JSON arrays: array n has as items the rows `start[n]:start[n + 1]` of `parts`."""
-    rows, first = len(start) - 1, np.zeros(start[-1] + 1, dtype=bool)
-    first[start[:-1]] = True
-    return [repeat_text(b"[", rows), RowGroups(start, [_COMMA.at(first[:-1]), *parts]), repeat_text(b"]", rows)]
+@dataclass(frozen=True)
+class RepeatedMessages:
+    """A repeated field: in row n the rows `start[n]:start[n + 1]` of its content, or of the pool's `which[n]`."""
+
+    start: Int
+    content: Any  # that of messages, or times; in JSON any value
+    which: Int | None = None
+    pool: MessagePool | None = None
+
+
+Content: TypeAlias = Mapping[str, "float | NDArray[Any] | RowTexts | Instants | Content | RepeatedMessages"]
+"""Values by field: numbers (N,) or one for all, of an array of K numbers (N, K), texts, times, the content of a
+message, the messages of a repeated field. A field that is left out has its default in all rows."""
+
+
+def optional_message(said: Bool, content: Content | Instants) -> RepeatedMessages:
+    """A message in the rows `said` (N,) only; `content` has these rows alone."""
+    return RepeatedMessages(start_offsets(said), content)
 
 
 # Protobuf messages, with the bytes of `SerializeToString(deterministic=True)`.
 
 _VARINT, _FIXED64, _SIZED = 0, 1, 2  # wire types
-
-Content: TypeAlias = Mapping[str, "float | NDArray[Any] | RowTexts | Content | RepeatedMessages"]
-"""Values by field: numbers (N,) or one for all, texts, the content of a message; of a repeated field its rows, or all
-of it, encoded already.
-"""
-
-
-@dataclass(frozen=True)
-class RepeatedMessages:
-    """The messages of a repeated field: in row n those of rows `start[n]:start[n + 1]`."""
-
-    start: Int
-    content: Content
-
-
-def optional_message(said: Bool, content: Content) -> RepeatedMessages:
-    """A message in the rows `said` (N,) only; `content` has these rows alone."""
-    return RepeatedMessages(start_offsets(said), content)
 
 
 def encode_messages(descriptor: Descriptor, content: Content, rows: int) -> list[bytes]:
@@ -282,8 +289,10 @@ def encode_messages(descriptor: Descriptor, content: Content, rows: int) -> list
     return encode_records(_encode_fields(descriptor, content, rows), rows)
 
 
-def _encode_fields(descriptor: Descriptor, content: Content, rows: int) -> list[RecordPart]:
+def _encode_fields(descriptor: Descriptor, content: Content | Instants, rows: int) -> list[RecordPart]:
     """The parts of a message: its fields in the order of their numbers; without repeated ones that no row has."""
+    if isinstance(content, Instants):
+        content = dict(zip(("seconds", "nanos"), np.divmod(content.time_ns, 1_000_000_000), strict=True))
     there = {
         name: value for name, value in content.items() if not isinstance(value, RepeatedMessages) or value.start[-1]
     }
@@ -301,13 +310,78 @@ def _encode_field(field: FieldDescriptor, value: Any, rows: int) -> RecordPart:
         return repeat_text(encode_records([_encode_field(field, value, 1)], 1)[0], rows)
     number = field.number << 3
     if isinstance(value, RepeatedMessages):
+        if value.pool is not None and value.which is not None:
+            return value.pool.encode(field).at(value.which)
         inside = int(value.start[-1])
         parts = _encode_fields(field.message_type, value.content, inside)
         return RowGroups(value.start, [SizedField(number | _SIZED, parts, inside, always=True)])
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping | Instants):
         return SizedField(number | _SIZED, _encode_fields(field.message_type, value, rows), rows, always=True)
     if isinstance(value, RowTexts):
-        return value if field.message_type else SizedField(number | _SIZED, [value], rows, always=field.has_presence)
+        return SizedField(number | _SIZED, [value], rows, always=field.has_presence)
     wire, dtype = (_FIXED64, np.float64) if field.type == field.TYPE_DOUBLE else (_VARINT, np.int64)
     column = value if isinstance(value, np.ndarray) else np.full(rows, value, dtype=dtype)
     return NumberField(number | wire, column, always=field.has_presence)
+
+
+# JSON, as orjson writes it.
+
+_COMMA, _NULL = TextPool.of([b",", b""]), TextPool.of([b"null", b""])
+
+
+@dataclass(frozen=True)
+class StatedRows:
+    """A value in the rows `said` (N,) only, `values` of these rows alone; the others have null, or nothing."""
+
+    said: Bool
+    values: NDArray[Any]
+    null: bool = True
+
+
+JsonContent: TypeAlias = Mapping[str, Any]
+"""Values by name, in this order: those of `Content` but for times, `StatedRows`, and None, which is null."""
+
+
+def encode_json(content: JsonContent, rows: int) -> list[bytes]:
+    """One encoded object for each row."""
+    return encode_records(_encode_value(content, rows), rows)
+
+
+def _encode_value(value: Any, rows: int) -> list[RecordPart]:
+    """The parts of a value of JSON."""
+    if value is None:
+        return [repeat_text(b"null", rows)]
+    if isinstance(value, RowTexts):
+        return [value.source.quoted.at(value.which)]
+    if isinstance(value, StatedRows):
+        start = start_offsets(value.said)
+        return [RowGroups(start, _encode_value(value.values, int(start[-1]))), _NULL.at(value.said)]
+    if isinstance(value, RepeatedMessages):
+        return _encode_arrays(value.start, _encode_value(value.content, int(value.start[-1])))
+    if isinstance(value, Mapping):
+        parts: list[RecordPart] = []
+        for name, inner in value.items():
+            key = b"%s%s:" % (b"," if parts else b"{", orjson.dumps(name))
+            if isinstance(inner, StatedRows) and not inner.null:
+                there = int(inner.said.sum())
+                field = [repeat_text(key, there), *_encode_value(inner.values, there)]
+                parts.append(RowGroups(start_offsets(inner.said), field))
+            else:
+                parts += [repeat_text(key, rows), *_encode_value(inner, rows)]
+        return [*parts, repeat_text(b"}", rows)]
+    return [_encode_numbers(value, rows)]
+
+
+def _encode_numbers(values: NDArray[Any], rows: int) -> RowTexts:
+    """The part of numbers (N,); null where one is not finite."""
+    text = orjson.dumps(np.ascontiguousarray(values), option=orjson.OPT_SERIALIZE_NUMPY)
+    commas = np.flatnonzero(np.frombuffer(text, dtype=np.uint8) == ord(","))
+    first = np.concatenate([[1], commas + 1])[:rows]
+    return TextPool(text, first, np.append(commas, len(text) - 1)[:rows] - first).at(np.arange(rows))
+
+
+def _encode_arrays(start: Int, parts: Sequence[RecordPart]) -> list[RecordPart]:
+    """The parts of arrays: array n has as items the rows `start[n]:start[n + 1]` of `parts`."""
+    rows, first = len(start) - 1, np.zeros(start[-1] + 1, dtype=bool)
+    first[start[:-1]] = True
+    return [repeat_text(b"[", rows), RowGroups(start, [_COMMA.at(first[:-1]), *parts]), repeat_text(b"]", rows)]

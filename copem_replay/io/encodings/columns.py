@@ -6,21 +6,23 @@ list. Its *level* is the path up to its last `[]`: `""` for the message itself, 
 that reads a format works on these columns, whatever the encoding of the messages.
 
 A `Definition` makes the columns of one encoding. The walks through CDR and protobuf know no types: they give the bits
-of numbers and the places of texts, and `RawColumn` makes columns of them.
+of numbers and the places of texts, of which `walk_columns` makes columns.
 """
 
 from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.io.decoded_size import check_decoded_bytes
 
 
 @dataclass(frozen=True)
@@ -240,10 +242,6 @@ def common_level(one: str, other: str) -> str:
 # Raw values of messages, the bits of numbers and the bytes of texts, made into columns.
 
 
-class DefinitionError(ValueError):
-    """A definition that cannot be used, and why."""
-
-
 @dataclass(frozen=True)
 class ValueKind:
     """The kind of a column's values.
@@ -261,7 +259,7 @@ class ValueKind:
         return self.how not in ("text", "ended", "bytes")
 
 
-class RawColumn:
+class _RawColumn:
     """The values of one path, gathered batch by batch."""
 
     def __init__(self, kind: ValueKind) -> None:
@@ -271,13 +269,9 @@ class RawColumn:
         self._said: list[Bool] = []
         self._code_of: dict[bytes, int] = {}
 
-    def add(self, data: bytes, bits: Any, lengths: Int, said: Bool | None = None) -> None:
-        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`.
-
-        `said (R,)`: False where a message has no value; None: every message has one.
-        """
-        if said is not None:
-            self._said.append(said)
+    def add(self, data: bytes, bits: Any, lengths: Int, said: Bool) -> None:
+        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`, and where there is one."""
+        self._said.append(said)
         if self._kind.is_number:
             self._values.append(_decode_numbers(bits, self._kind.how))
             return
@@ -293,8 +287,7 @@ class RawColumn:
         else:
             of_code = np.array([_parse_number(p, self._kind.how) for p in self._code_of], dtype=np.float64)
             values = of_code[join_arrays(self._codes, np.int64)]
-        if self._said:
-            values[~join_arrays(self._said, bool)] = np.nan
+        values[~join_arrays(self._said, bool)] = np.nan
         return values
 
     def texts(self) -> DistinctTexts:
@@ -309,8 +302,7 @@ class RawColumn:
         distinct = dict.fromkeys(words)  # different bytes may be the same text
         number = {word: k for k, word in enumerate(distinct)}
         code = np.array([number[w] for w in words], dtype=np.int64)[code]
-        if self._said:
-            code[~join_arrays(self._said, bool)] = -1
+        code[~join_arrays(self._said, bool)] = -1
         return DistinctTexts(code, tuple(distinct))
 
     def _word_of_number(self, value: Any) -> str:
@@ -319,21 +311,72 @@ class RawColumn:
         return self._kind.names.get(value) or format_number(value)
 
 
-def shred_columns(
-    parents: Mapping[str, Int],
-    columns: Mapping[str, RawColumn],
+Walk = Callable[[NDArray[np.uint8], Int, Int, Int, Any, Int, Bool, Int], Int]
+"""(L,) number of rows of each level, by a walk through messages m, `data[bounds[m]:bounds[m + 1]]`.
+
+Arguments: data, bounds, `first`, `room`, `bits`, `lengths`, `said`, `parent`. `room (L,)`: rows there is room for; more
+are counted and not kept. The value of column c in row r of its level goes to `bits[first[c] + r]`, with `said`;
+of a text that is its begin, and `lengths` has its length. `parent[l, r]` is the parent of row r of level l; level 0 is
+the message. A message that cannot be decoded leaves no rows.
+"""
+
+
+def walk_columns(
+    walk: Walk,
+    batches: Iterable[tuple[Int, Sequence[bytes]]],
+    kinds: Mapping[str, ValueKind],
     numbers: Collection[str],
     texts: Collection[str],
-    decoded: Bool,
+    count: int,
 ) -> ShreddedMessages:
-    """The levels with their `parents`, by name, and the columns by path in them."""
-    levels = {name: LevelRows(parent, {}, {}) for name, parent in parents.items()}
+    """The columns of `count` messages, from batches of their numbers and payloads. Raises OversizeError.
+
+    `kinds`: of the values of each path, in the order of the walk's columns.
+    """
+    names = list_levels(kinds)
+    level_ix = np.array([names.index(list_level(path)) for path in kinds], dtype=np.int64)
+    columns = {path: _RawColumn(kind) for path, kind in kinds.items()}
+    parents: dict[str, list[Int]] = {name: [] for name in names}
+    rows = np.zeros(len(names), dtype=np.int64)
+    for number, payloads in batches:
+        data = b"".join(payloads)
+        batch_rows, taken, parent = _walk_batch(walk, data, list(map(len, payloads)), level_ix, len(names))
+        for k, name in enumerate(names):
+            of = parent[k, : batch_rows[k]]
+            parents[name].append(of + rows[names.index(parent_level(name))] if name else number[of])
+        for column, values in zip(columns.values(), taken, strict=True):
+            column.add(data, *values)
+        rows += batch_rows
+    levels = {name: LevelRows(join_arrays(parts, np.int64), {}, {}) for name, parts in parents.items()}
     for path, column in columns.items():
         if path in numbers:
             levels[list_level(path)].numbers[path] = column.numbers()
         if path in texts:
             levels[list_level(path)].texts[path] = column.texts()
+    decoded = np.zeros(count, dtype=bool)
+    decoded[levels[""].parent] = True
     return ShreddedMessages(levels, decoded)
+
+
+def _walk_batch(
+    walk: Walk, data: bytes, sizes: Sequence[int], level_ix: Int, levels: int
+) -> tuple[Int, list[tuple[Any, Int, Bool]], Int]:
+    """Number of rows of each level; bits, lengths and presence of each column; parents (levels, most rows)."""
+    octets, bounds = np.frombuffer(data, dtype=np.uint8), np.cumsum([0, *sizes], dtype=np.int64)
+    first = np.zeros(len(level_ix) + 1, dtype=np.int64)
+
+    def walk_into(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Bool, Int]:
+        bits, lengths = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
+        said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
+        return walk(octets, bounds, first, room, bits, lengths, said, parent), bits, lengths, said, parent
+
+    rows = walk_into(np.zeros(levels, dtype=np.int64), 0, 0)[0]  # counts them
+    most = int(rows.max(initial=0))
+    np.cumsum(rows[level_ix], out=first[1:])
+    check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * most)
+    _, bits, lengths, said, parent = walk_into(rows, int(first[-1]), most)
+    parts = [slice(*ends) for ends in pairwise(first.tolist())]
+    return rows, [(bits[p], lengths[p], said[p]) for p in parts], parent
 
 
 def join_arrays(parts: Sequence[Any], kind: Any) -> Any:

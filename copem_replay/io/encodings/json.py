@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import NoneType
 from typing import Any
 
@@ -138,10 +138,9 @@ def _parse_quickly(payload: bytes) -> Any:
 class _WantedPlace:
     """A place in a message on the way to wanted paths: the fields to step into, and the columns to take here."""
 
-    def __init__(self) -> None:
-        self.fields: dict[str, _WantedPlace] = {}
+    def __init__(self, level: str) -> None:
+        self.level, self.fields = level, dict[str, _WantedPlace]()
         self.item: _WantedPlace | None = None  # of a list
-        self.level = ""
         self.number: str | None = None  # the path whose column this is
         self.text: str | None = None
 
@@ -244,36 +243,20 @@ def _convert_number(value: Any) -> float:
 
 
 def _plan_places(numbers: Sequence[str], texts: Sequence[str]) -> _WantedPlace:
-    root = _WantedPlace()
+    root = _WantedPlace("")
     for path, is_text in (*((p, False) for p in numbers), *((p, True) for p in texts)):
-        place = root
-        for step in _path_steps(path):
-            if step == "[]":
-                if place.item is None:
-                    place.item = _WantedPlace()
+        place, here = root, ""
+        for part in path.split("."):
+            name = part.rstrip("[]")
+            if name:
+                here = f"{here}.{name}" if here else name
+                place = place.fields.setdefault(name, _WantedPlace(place.level))
+            for _ in range(part.count("[]")):
+                here += "[]"
+                place.item = place.item or _WantedPlace(here)
                 place = place.item
-            else:
-                place = place.fields.setdefault(step, _WantedPlace())
         if is_text:
             place.text = path
         else:
             place.number = path
-    _name_levels(root, "", "")
     return root
-
-
-def _path_steps(path: str) -> Iterator[str]:
-    """`a.b[].c` → a, b, [], c."""
-    for part in path.split("."):
-        name = part.rstrip("[]")
-        if name:
-            yield name
-        yield from ["[]"] * part.count("[]")
-
-
-def _name_levels(place: _WantedPlace, path: str, level: str) -> None:
-    place.level = level
-    for name, inner in place.fields.items():
-        _name_levels(inner, f"{path}.{name}" if path else name, level)
-    if place.item is not None:
-        _name_levels(place.item, f"{path}[]", f"{path}[]")

@@ -8,9 +8,8 @@ stops at bytes that are no message. Wire format: protobuf.dev/programming-guides
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
@@ -19,20 +18,16 @@ from numpy.typing import NDArray
 
 from copem_replay.core.compiled import callee, kernel
 from copem_replay.core.tracks import Bool, Int
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.decoded_size import MESSAGE_LIMIT_BYTES, check_decoded_bytes
 from copem_replay.io.encodings.columns import (
-    COLUMN_BYTES,
     Definition,
-    DefinitionError,
-    RawColumn,
     ShreddedMessages,
     ValueKind,
-    join_arrays,
     list_level,
     list_levels,
-    parent_level,
-    shred_columns,
     split_batches,
+    walk_columns,
 )
 
 # The kernel.
@@ -42,8 +37,8 @@ VARINT, FIXED64, BYTES, GROUP, END_GROUP, FIXED32 = range(6)
 MESSAGE = 6
 """Besides the wire types, in the table of fields: bytes that are a message to step into, as groups are."""
 NUMBER, WHAT, COLUMN, LEVEL, INTO = range(5)
-"""Columns of the table of fields: the field's number, its wire type or MESSAGE, its column or −1 (of a message: where
-is said whether it is there), the level of a repeated field or −1, the kind of message inside or −1."""
+"""Columns of the table of fields: the field's number, its wire type or MESSAGE, its column or −1, the level of a
+repeated field or −1, the kind of message inside or −1."""
 DEEPEST = 32
 """Messages within messages, at most; no path leads deeper."""
 
@@ -116,13 +111,10 @@ def walk_protobuf(
     data: NDArray[np.uint8], bounds: Int, fields: Int, node_first: Int, node_level: Int, blank: Int, blank_first: Int,
     first: Int, room: Int, bits: Any, lengths: Int, said: Bool, parent: Int,
 ) -> Int:  # fmt: skip
-    """(L,) number of rows of each level. `room (L,)`: rows there is room for; those beyond are counted and not kept.
+    """As `Walk`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and is of level `node_level[n]`.
 
-    Message m is `data[bounds[m]:bounds[m + 1]]`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and
-    is of level `node_level[n]`; where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or
-    empty, as all are before, unless it states another value. The value of column c in row r of its level goes to
-    `bits[first[c] + r]`, with `said` and, of a text, `lengths`. `parent[l, r]` is the parent of row r of level l; level
-    0 is the message.
+    Where it is present, its columns `blank[blank_first[n]:blank_first[n + 1]]` are 0 or empty, as all are before,
+    unless it states another value.
     """
     rows = np.zeros(len(room), dtype=np.int64)
     ends = np.zeros(DEEPEST, dtype=np.int64)
@@ -173,8 +165,6 @@ def walk_protobuf(
                 if wire != (GROUP if what == GROUP else BYTES) or depth + 1 == DEEPEST:
                     offset = after
                     continue
-                if column >= 0 and rows[node_level[node]] <= room[node_level[node]]:
-                    said[first[column] + rows[node_level[node]] - 1] = True
                 if level >= 0:
                     if rows[level] < room[level]:
                         parent[level, rows[level]] = rows[node_level[node]] - 1
@@ -363,28 +353,17 @@ class ProtobufDefinition(Definition):
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
         """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
         numbers, texts = tuple(numbers), tuple(texts)
-        wanted = self._known((*numbers, *texts))
-        table = FieldTable(self._root, wanted)
-        columns = [RawColumn(table.kinds[path]) for path in wanted]
-        rows = np.zeros(len(table.levels), dtype=np.int64)
-        parents: list[list[Int]] = [[] for _ in table.levels]
-        decoded = np.zeros(len(payloads), dtype=bool)
-        for batch in split_batches(payloads):
-            whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
-            good = batch.start + np.flatnonzero([p is not None for p in whole])
-            decoded[good] = True
-            walked = walk_messages([p for p in whole if p is not None], table)
-            for k, name in enumerate(table.levels):
-                of = walked.parent[k, : walked.rows[k]]
-                parents[k].append(of + rows[table.levels.index(parent_level(name))] if name else good[of])
-            for column, taken in zip(columns, walked.columns, strict=True):
-                column.add(walked.data, *taken)
-            rows += walked.rows
+        table = _FieldTable(self._root, self._known((*numbers, *texts)))
 
-        by_level = {name: join_arrays(parents[k], np.int64) for k, name in enumerate(table.levels)}
-        return shred_columns(by_level, dict(zip(wanted, columns, strict=True)), numbers, texts, decoded)
+        def canonical() -> Iterator[tuple[Int, list[bytes]]]:
+            for batch in split_batches(payloads):
+                whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
+                good = batch.start + np.flatnonzero([p is not None for p in whole])
+                yield good, [p for p in whole if p is not None]
 
-    def _canonical(self, payload: bytes, closed: Mapping[int, Int]) -> bytes | None:
+        return walk_columns(table.walk, canonical(), table.kinds, numbers, texts, len(payloads))
+
+    def _canonical(self, payload: bytes, closed: bool) -> bytes | None:
         """The message with every known field once; None: no message. Raises OversizeError."""
         self._size.check(payload)
         try:
@@ -415,20 +394,19 @@ class ProtobufDefinition(Definition):
             level = below
 
 
-class FieldTable:
+class _FieldTable:
     """The fields that lead to `wanted` paths, for the walk, by the kind of message they are in.
 
-    A path may name a message that is not repeated: whether it is there. `levels`: all that lead to the paths, the outer
-    ones first. `closed`: numbers of an enumeration by column, where Google's parser takes others as unknown fields.
+    `closed`: whether a column is of an enumeration of which Google's parser takes other numbers as unknown fields,
+    which may hide one that is known.
     """
 
     def __init__(self, root: Any, wanted: Sequence[str]) -> None:
         self.kinds: dict[str, ValueKind] = {}
-        self.closed: dict[int, Int] = {}
-        self.levels = list_levels(wanted)
-        self.level_ix = np.array([self.levels.index(list_level(path)) for path in wanted], dtype=np.int64)
+        self.closed = False
+        levels = list_levels(wanted)
         nodes: list[tuple[Any, str]] = [(root, "")]
-        node_of, entries = {"": 0}, dict[str, list[int]]()
+        node_of = {"": 0}
         fields: list[list[list[int]]] = [[]]
         blank: list[list[int]] = [[]]
         for column, path in enumerate(wanted):
@@ -436,7 +414,7 @@ class FieldTable:
             for part in path.split("."):
                 here = f"{here}.{part}" if here else part
                 field = nodes[node][0].fields_by_name[part.removesuffix("[]")]
-                level = self.levels.index(here) if field.is_repeated else -1
+                level = levels.index(here) if field.is_repeated else -1
                 if field.message_type is None:
                     fields[node].append([field.number, _TYPES[field.type][0], column, level, -1])
                     if not field.is_repeated and not field.has_presence:
@@ -444,67 +422,28 @@ class FieldTable:
                     continue
                 if here not in node_of:
                     what = GROUP if field.type == FieldDescriptor.TYPE_GROUP else MESSAGE
-                    node_of[here], entries[here] = len(nodes), [field.number, what, -1, level, len(nodes)]
+                    node_of[here] = len(nodes)
+                    fields[node].append([field.number, what, -1, level, len(nodes)])
                     nodes.append((field.message_type, here))
-                    fields[node].append(entries[here])
                     fields.append([])
                     blank.append([])
                 node = node_of[here]
-            if field.message_type is not None:
-                entries[path][COLUMN] = column
-                continue
             self.kinds[path] = ValueKind(_TYPES[field.type][1], _enum_names(field) if field.enum_type else {})
-            if field.enum_type is not None and field.enum_type.is_closed:
-                self.closed[column] = np.array(sorted(_enum_names(field)), dtype=np.int32)
+            self.closed |= field.enum_type is not None and field.enum_type.is_closed
         self.fields = np.array([row for rows in fields for row in rows], dtype=np.int64).reshape(-1, 5)
         self.node_first = np.cumsum([0, *map(len, fields)], dtype=np.int64)
-        self.node_level = np.array([self.levels.index(list_level(path)) for _, path in nodes], dtype=np.int64)
+        self.node_level = np.array([levels.index(list_level(path)) for _, path in nodes], dtype=np.int64)
         self.blank = np.array([column for columns in blank for column in columns], dtype=np.int64)
         self.blank_first = np.cumsum([0, *map(len, blank)], dtype=np.int64)
 
-    def has_unknown_names(self, walked: WalkedMessages) -> bool:
-        """Whether a value is none of its closed enumeration: a field that is unknown to Google's parser."""
-        for column, known in self.closed.items():
-            bits, _, there = walked.columns[column]
-            if not np.isin(np.unique(bits[there]).astype(np.uint32).view(np.int32), known).all():
-                return True
-        return False
+    def walk(
+        self, data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, said: Bool,
+        parent: Int,
+    ) -> Int:  # fmt: skip
+        """The walk through messages as Google's parser has written them."""
+        plan = (self.fields, self.node_first, self.node_level, self.blank, self.blank_first)
+        return walk_protobuf(data, bounds, *plan, first, room, bits, lengths, said, parent)
 
 
 def _enum_names(field: Any) -> dict[int, str]:
     return {v.number: v.name for v in field.enum_type.values}
-
-
-class WalkedMessages(NamedTuple):
-    """What the walk takes of messages that lie one after the other in `data`; L levels, C columns."""
-
-    data: bytes
-    rows: Int  # (L,) number of rows of each level
-    columns: list[tuple[Any, Int, Bool]]  # C: bits of numbers or places of texts, lengths of texts, whether it is there
-    parent: Int  # (L, most rows) the row of the level above, of level 0 the message
-
-
-def walk_messages(payloads: Sequence[bytes], table: FieldTable, rows: Int | None = None) -> WalkedMessages:
-    """The columns of messages that Google's parser has written. Raises OversizeError.
-
-    `rows` (L,): number of rows of each level; None: they are counted first, as long as the walk itself takes.
-    """
-    data, levels = b"".join(payloads), len(table.levels)
-    bounds = np.cumsum([0, *map(len, payloads)], dtype=np.int64)
-    octets = np.frombuffer(data, dtype=np.uint8)
-    plan = (table.fields, table.node_first, table.node_level, table.blank, table.blank_first)
-    first = np.zeros(len(table.level_ix) + 1, dtype=np.int64)
-
-    def walk(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Bool, Int]:
-        bits, lengths = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
-        said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
-        rows = walk_protobuf(octets, bounds, *plan, first, room, bits, lengths, said, parent)
-        return rows, bits, lengths, said, parent
-
-    if rows is None:
-        rows = walk(np.zeros(levels, dtype=np.int64), 0, 0)[0]
-    np.cumsum(rows[table.level_ix], out=first[1:])
-    check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * int(rows.max(initial=0)))
-    _, bits, lengths, said, parent = walk(rows, int(first[-1]), int(rows.max(initial=0)))
-    parts = [slice(*ends) for ends in pairwise(first.tolist())]
-    return WalkedMessages(data, rows, [(bits[p], lengths[p], said[p]) for p in parts], parent)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from copem_replay.io.encodings.columns import DefinitionError
+from copem_replay.io.channel import DefinitionError
 
 _COLOURED = "foxglove_msgs/Color color"
 _MESHED = (f"{_COLOURED}", "foxglove_msgs/Color[] colors", "uint32[] indices")
@@ -180,6 +180,11 @@ _FIELDS: dict[str, tuple[str, ...]] = {
     ),
 }
 _RULE = "=" * 80
+
+
+def list_fields(name: str) -> list[tuple[str, str]]:
+    """The type and the name of each field of a type (`package/Type`), without constants."""
+    return [(kind, field) for kind, field, *_ in map(str.split, (f for f in _FIELDS[name] if "=" not in f))]
 
 
 def message_definition(name: str) -> bytes:

@@ -9,28 +9,23 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 from array import array
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
 from copem_replay.core.frame import SaidPlace
-from copem_replay.core.tracks import CLASSES, VALUES, Bool, Float, Int, Solid
+from copem_replay.core.tracks import CLASSES, VALUES, Solid
 from copem_replay.io.channel import LAST_NS
-from copem_replay.io.decoded_size import MOST_OBJECTS, STATE_BYTES, DecodeAllowance, check_objects
+from copem_replay.io.decoded_size import DecodeAllowance, check_objects
 from copem_replay.io.findings import FARTHEST_M, find
 from copem_replay.io.ground_truth import DecodedObjects, take_messages
 from copem_replay.io.schemas.osi_lanes import OsiRoad, read_road
 from copem_replay.io.stamps import settle_stamps
-
-if TYPE_CHECKING:
-    from copem_replay.io.encodings.protobuf import WalkedMessages
 
 GROUND_TRUTH = "osi3.GroundTruth"
 SENSOR_VIEW = "osi3.SensorView"
@@ -104,74 +99,14 @@ def _osi_size(message_class: Any) -> Any:
     return ProtobufSize(message_class.DESCRIPTOR)
 
 
-BATCH_BYTES = 4_000_000
-"""Bytes of ground truth whose moving objects are decoded at once by the compiled walk: for less it is not loaded."""
-_PLAIN_BATCHES = 3
-"""Batches that are decoded object by object where Numba is not loaded: importing it takes as long."""
-
-
 _Place = tuple[int, int, int]
 """Of a note: the message, whether the object is stationary, its place in the list."""
-
-# Of a moving object: what has to be there; what is read as bits, the fields in the order of VALUES first.
-_MARKS = ("id", "base.position", "base.orientation", "base.velocity")
-_VALUE_FIELDS = (
-    *(f"base.{name}" for name in ("position.x", "position.y", "position.z", "orientation.yaw")),
-    *(f"base.{name}" for name in ("velocity.x", "velocity.y")),
-    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
-)
-_FIELDS = (*_VALUE_FIELDS, "id.value", "type", "vehicle_classification.type")
-_KINDS = np.array([_CLASS_OF_TYPE.get(k, OTHER) for k in range(max(_CLASS_OF_TYPE) + 2)], dtype=np.int8)
-_VEHICLES = np.array([_CLASS_OF_VEHICLE.get(k, VEHICLE) for k in range(max(_CLASS_OF_VEHICLE) + 2)], dtype=np.int8)
-"""The class by number; the last is that of all higher ones."""
-
-
-class _ObjectRows:
-    """Rows of objects message by message, of moving or of stationary ones."""
-
-    def __init__(self) -> None:
-        self.of_message = array("q")  # number of rows of each message
-        self.object_ix, self.class_ix, self.values = array("q"), array("b"), array("d")
-        self.blocks: list[tuple[Int, Int, NDArray[np.int8], Float]] = []  # the same of messages after these
-
-    @property
-    def number(self) -> int:
-        """Number of rows."""
-        return len(self.object_ix) + sum(len(object_ix) for _, object_ix, *_ in self.blocks)
-
-    def columns(self) -> tuple[Int, Int, NDArray[np.int8], Float]:
-        """All rows: of each message their number, then columns (P,) and (P, len(VALUES))."""
-        first = (
-            np.asarray(self.of_message, dtype=np.int64),  # without a copy
-            np.asarray(self.object_ix, dtype=np.int64),
-            np.asarray(self.class_ix, dtype=np.int8),
-            np.asarray(self.values, dtype=np.float64).reshape(-1, len(VALUES)),
-        )
-        if not self.blocks:
-            return first
-        blocks = [first, *self.blocks] if self.of_message else self.blocks
-        of_message, object_ix, class_ix, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        return of_message, object_ix, class_ix, values
-
-
-def _join_rows(moving: _ObjectRows, stationary: _ObjectRows) -> dict[str, Any]:
-    """The columns of both, moving objects first in each message."""
-    names = ("rows", "object_ix", "class_ix", "values")
-    columns: tuple[Any, ...] = moving.columns()
-    if stationary.number:
-        beside = stationary.columns()
-        of_rows = [np.repeat(np.arange(len(rows)), rows) for rows, *_ in (columns, beside)]
-        order = np.argsort(np.concatenate(of_rows), kind="stable")
-        pairs: Any = zip(columns[1:], beside[1:], strict=True)
-        columns = (columns[0] + beside[0], *(np.concatenate(pair)[order] for pair in pairs))
-    return dict(zip(names, columns, strict=True))
 
 
 class GroundTruthDecoder:
     """Collects messages of one topic: `add` each payload, then take `columns`.
 
-    `allowance`: memory that all of them may take. Fields of objects are read one by one, which costs most, or, where
-    there are many, by the compiled walk through the messages as Google's parser writes them: the same rows and notes.
+    `allowance`: memory that all of them may take.
     """
 
     def __init__(self, allowance: DecodeAllowance) -> None:
@@ -183,9 +118,8 @@ class GroundTruthDecoder:
         self._hosts: list[str] = []
         self._moving_number: dict[int, int] = {}  # OSI id → number of the object
         self._stationary_number: dict[int, int] = {}
-        self._moving, self._stationary = _ObjectRows(), _ObjectRows()
-        self._waiting: list[tuple[int, bytes]] = []  # moving objects that are still to be added, and of which message
-        self._waiting_bytes, self._waiting_objects, self._batches, self._walk = 0, 0, 0, False
+        self._rows = array("q")  # number of rows of each message
+        self._object_ix, self._class_ix, self._values = array("q"), array("b"), array("d")  # moving objects first
         self._road = OsiRoad()  # of the first message that has one: the lanes of one message are those of all
         self._place: SaidPlace | None = None
         self._earlier: list[tuple[OsiRoad, Any]] = []  # the first road or place on earth before the window
@@ -227,9 +161,11 @@ class GroundTruthDecoder:
             self._add_place(truth, self._stamp_ns[-1])
         self._road = self._road or read_road(truth)
         check_objects(len(truth.moving_object) + len(truth.stationary_object))
+        before = len(self._object_ix)
+        self._add_moving(truth.moving_object)
         self._add_stationary(truth.stationary_object)
-        self._allowance.spend(0, self._stationary.of_message[-1])
-        self._wait(truth)
+        self._rows.append(len(self._object_ix) - before)
+        self._allowance.spend(0, self._rows[-1])
 
     def add_earlier(self, payload: bytes, schema: str) -> None:
         """Take what stays of a message before those that are read: its road, its place on earth, what stands.
@@ -247,7 +183,6 @@ class GroundTruthDecoder:
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
-        self._add_waiting()
         for road, truth in self._earlier:
             self._road = self._road or road
             if truth.proj_string and self._place is None:
@@ -270,7 +205,10 @@ class GroundTruthDecoder:
             log_time_ns=logged_ns,
             object_ids=ids,
             moving=np.array(moving, dtype=bool),
-            **_join_rows(self._moving, self._stationary),
+            rows=np.asarray(self._rows, dtype=np.int64),  # without a copy, as those that follow
+            object_ix=np.asarray(self._object_ix, dtype=np.int64),
+            class_ix=np.asarray(self._class_ix, dtype=np.int8),
+            values=np.asarray(self._values, dtype=np.float64).reshape(-1, len(VALUES)),
             lane_boundaries=tuple(self._road.lines),
             lanes=tuple(self._road.lanes),
             areas=tuple(self._road.crosswalks),
@@ -300,88 +238,14 @@ class GroundTruthDecoder:
             changed = f"{what} is {before} first and {now} at {stamp_ns / 1e9:.3f} s: expected one of all messages"
             self._place = place._replace(changed=changed)
 
-    def _wait(self, truth: Any) -> None:
-        """Keep the moving objects of a message, no map; add those that wait where they are many."""
-        self._waiting_objects += len(truth.moving_object)
-        for field, _ in truth.ListFields():
-            if field.name != "moving_object":
-                truth.ClearField(field.name)
-        self._waiting.append((self._messages, truth.SerializePartialToString()))
-        self._waiting_bytes += len(self._waiting[-1][1])
-        if self._waiting_bytes > BATCH_BYTES or self._waiting_objects > MOST_OBJECTS:
-            self._walk = self._walk or "numba" in sys.modules or self._batches >= _PLAIN_BATCHES
-            self._add_waiting()
-
-    def _add_waiting(self) -> None:
-        before = self._moving.number
-        if self._walk:
-            self._walk_moving()
-        else:
-            for message, content in self._waiting:
-                self._add_moving(message, self._message_of[GROUND_TRUTH].FromString(content).moving_object)
-        self._batches += 1
-        self._waiting, self._waiting_bytes, self._waiting_objects = [], 0, 0
-        self._allowance.spend(STATE_BYTES * (self._moving.number - before), -1)
-
-    def _walk_moving(self) -> None:
-        """As `_add_moving`, for all messages that wait."""
-        walked = self._walk_waiting()
-        bits = {path: taken[0] for path, taken in zip((*_MARKS, *_FIELDS), walked.columns, strict=True)}
-        there = {path: taken[-1] for path, taken in zip((*_MARKS, *_FIELDS), walked.columns, strict=True)}
-        values = np.array([bits[path].view(np.float64) for path in _VALUE_FIELDS]).T  # columns lie together
-        named, placed, turned, moved = (there[path] for path in _MARKS)
-        unset = np.array([~there[path] for path in _VALUE_FIELDS[:6]]).T & (values[:, :6] == 0.0)
-        unset &= np.array([placed, placed, placed, turned, moved, moved]).T
-        values[~placed, 0] = _NAN  # nowhere is not the origin
-        values[~moved, 4:6] = _NAN
-        of_message = walked.parent[1, : walked.rows[1]]
-        self._note_rows(of_message, ~named, "no id")
-        self._note_rows(of_message, named & ~turned, "yaw unset")
-        self._note_rows(of_message, named & unset.any(axis=1), "zero unset")
-        kind, vehicle = (bits[path].astype(np.uint32) for path in ("type", "vehicle_classification.type"))
-        of_vehicle = _VEHICLES[np.minimum(vehicle, len(_VEHICLES) - 1)]
-        class_ix = np.where(kind == _IS_VEHICLE, of_vehicle, _KINDS[np.minimum(kind, len(_KINDS) - 1)])
-        rows = slice(None) if named.all() else np.flatnonzero(named)
-        ids, which = np.unique(bits["id.value"][rows], return_inverse=True)
-        number_of = self._moving_number
-        numbers = [number_of[k] if k in number_of else self._next_number(number_of, k) for k in ids.tolist()]
-        per_message = np.bincount(of_message[rows], minlength=len(self._waiting))
-        object_ix = np.array(numbers, dtype=np.int64)[which]
-        self._moving.blocks.append((per_message, object_ix, class_ix[rows], values[rows]))
-
-    def _walk_waiting(self) -> WalkedMessages:
-        """The columns of the moving objects that wait."""
-        from copem_replay.io.encodings.protobuf import FieldTable, walk_messages
-
-        truth_class = self._message_of[GROUND_TRUTH]
-        table = FieldTable(truth_class.DESCRIPTOR, [f"moving_object[].{path}" for path in (*_MARKS, *_FIELDS)])
-        payloads = [content for _, content in self._waiting]
-        rows = np.array([len(payloads), self._waiting_objects])
-        walked = walk_messages(payloads, table, rows)
-        if not table.has_unknown_names(walked):
-            return walked
-        messages = [truth_class.FromString(content) for content in payloads]
-        for message in messages:
-            message.DiscardUnknownFields()  # such a one may hide one that is known
-        return walk_messages([message.SerializePartialToString() for message in messages], table, rows)
-
-    def _note_rows(self, of_message: Int, rows: Bool, rule: str) -> None:
-        """Count a finding for some rows (P,) of the messages that wait; `of_message` (P,): their numbers."""
-        found = np.flatnonzero(rows)
-        if len(found):
-            first = of_message[found[0]]
-            place = int(found[0] - np.searchsorted(of_message, first))
-            self._note(rule, (self._waiting[first][0], 0, place), len(found))
-
-    def _add_moving(self, message: int, objects: Any) -> None:
+    def _add_moving(self, objects: Any) -> None:
         """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
-        number_of, next_number, before = self._moving_number, self._next_number, len(self._moving.object_ix)
-        add_object, add_class = self._moving.object_ix.append, self._moving.class_ix.append
-        add_values = self._moving.values.extend
+        number_of, next_number = self._moving_number, self._next_number
+        add_object, add_class, add_values = self._object_ix.append, self._class_ix.append, self._values.extend
         for k, moving in enumerate(objects):
             ident = moving.id.value
             if ident == 0 and not moving.HasField("id"):
-                self._note("no id", (message, 0, k))
+                self._note("no id", (self._messages, 0, k))
                 continue
             base = moving.base
             position, size, velocity = base.position, base.dimension, base.velocity
@@ -390,7 +254,7 @@ class GroundTruthDecoder:
             if 0.0 in (x, y, z, yaw, vx, vy):
                 (x, y, z, yaw, vx, vy), rules = check_zeros(base, (x, y, z, yaw, vx, vy))
                 for rule in rules:
-                    self._note(rule, (message, 0, k))
+                    self._note(rule, (self._messages, 0, k))
             kind = moving.type
             if kind == _IS_VEHICLE:
                 # Only here: writers are known that classify pedestrians as some vehicle.
@@ -400,7 +264,6 @@ class GroundTruthDecoder:
             number = number_of.get(ident)
             add_object(next_number(number_of, ident) if number is None else number)
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
-        self._moving.of_message.append(len(self._moving.object_ix) - before)
 
     def _add_stationary(self, objects: Any) -> None:
         """Add a row of class `other`, at rest, for each that stands; those with a base polygon become solids.
@@ -408,13 +271,12 @@ class GroundTruthDecoder:
         Many writers send them once. They stay until a message that repeats some of them leaves them out.
         """
         self._find_standing(objects)
-        number_of, rows = self._stationary_number, self._stationary
+        number_of = self._stationary_number
         for ident, values in self._standing.items():
             number = number_of.get(ident)
-            rows.object_ix.append(self._next_number(number_of, ident) if number is None else number)
-            rows.class_ix.append(OTHER)
-            rows.values.extend(values)
-        rows.of_message.append(len(self._standing))
+            self._object_ix.append(self._next_number(number_of, ident) if number is None else number)
+            self._class_ix.append(OTHER)
+            self._values.extend(values)
 
     def _find_standing(self, objects: Any, *, told: bool = True) -> None:
         """Take the stationary objects of a message, with findings if they are `told`."""

@@ -17,6 +17,8 @@ from copem_replay.io.channel import ENCODINGS, Channel, schema_name
 
 DETAIL_SCHEMA = "copem_replay.ListDetail"
 """What `replay.mcap` says beside osi3.SensorData, as JSON."""
+STRING = "std_msgs/msg/String"
+"""The message of ROS 2 that holds such JSON."""
 
 if TYPE_CHECKING:
     from copem_replay.io.schemas.description import Description

@@ -14,7 +14,7 @@ detections table has it: from `detection_s` on, while the newest list holds it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,17 +31,14 @@ from copem_replay.core.tracks import (
     Scene,
 )
 from copem_replay.io.encodings.column_bytes import (
-    RecordPart,
-    RowGroups,
+    Content,
+    JsonContent,
+    RepeatedMessages,
+    StatedRows,
     TextPool,
-    encode_arrays,
-    encode_numbers,
-    encode_records,
-    encode_texts,
+    encode_json,
     expand_ranges,
-    repeat_text,
     split_into_blocks,
-    start_offsets,
 )
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA
 
@@ -67,6 +64,8 @@ def _list_of(**fields: dict[str, Any]) -> dict[str, Any]:
 _INTEGER, _TEXT, _NUMBER = {"type": "integer"}, {"type": "string"}, {"type": ["number", "null"]}
 STATUS_JSON = _describe_messages(STATUS_SCHEMA, objects=_list_of(id=_TEXT, status=_TEXT, age_s=_NUMBER))
 
+_STATUSES = TextPool.of(STATUSES)
+
 
 class Statuses:
     """The statuses of the measured objects of one run; `table`: the rows of this log, configuration and run."""
@@ -80,10 +79,10 @@ class Statuses:
         }
         self._objects = np.array([*known_ns], dtype=np.int64)
         self._known_ns = np.array([*known_ns.values()], dtype=np.int64)
-        self.names = [scene.object_ids[number] for number in known_ns]
+        self._names = TextPool.of([scene.object_ids[number] for number in known_ns])
 
-    def at(self, available_ns: Int) -> tuple[Int, Float]:
-        """(F, K) index into STATUSES, and (F, K) age of the entry in s, NaN: none; of each list and object."""
+    def at(self, available_ns: Int) -> RepeatedMessages:
+        """The status of each object, and the age of its entry in s, NaN: none; of each list."""
         rows, bounds = self._fused_tracks.listed_rows
         frame, number = np.repeat(np.arange(len(available_ns)), np.diff(bounds)), self._fused_tracks.fused.row_object_ix
         available_s = (available_ns - self._t0_ns) * 1e-9
@@ -92,7 +91,13 @@ class Statuses:
         every[frame, number[rows]] = _round_to_us(ages_s)
         age_s = every[:, self._objects]
         is_known = available_ns[:, None] >= self._known_ns - SAME_INSTANT_NS
-        return np.where(np.isnan(age_s), 0, np.where(is_known, 2, 1)), np.where(np.isfinite(age_s), age_s, np.nan)
+        status = np.where(np.isnan(age_s), 0, np.where(is_known, 2, 1))
+        each: Content = {
+            "id": self._names.at(np.tile(np.arange(len(self._objects)), len(available_ns))),
+            "status": _STATUSES.at(status.ravel()),
+            "age_s": np.where(np.isfinite(age_s), age_s, np.nan).ravel(),
+        }
+        return RepeatedMessages(np.arange(len(available_ns) + 1) * len(self._objects), each)
 
 
 def _round_to_us(time_s: Float) -> Float:
@@ -105,34 +110,22 @@ def _round_to_us(time_s: Float) -> Float:
     return rounded
 
 
-class StatusWriter:
-    """Turns statuses into messages of JSON, one per list."""
+def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+    """Messages of JSON."""
+    return encode_json({"available_ns": available_ns, "objects": objects}, len(available_ns))
 
-    def __init__(self, statuses: Statuses) -> None:
-        self._statuses = statuses
+
+class StatusWriter:
+    """Turns statuses into messages, one per list; `encode`: of the instants and the statuses at each."""
+
+    def __init__(
+        self, statuses: Statuses, encode: Callable[[Int, RepeatedMessages], list[bytes]] = encode_statuses
+    ) -> None:
+        self._statuses, self._encode = statuses, encode
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
-        names = self._statuses.names
-        lists, objects = len(available_ns), len(names)
-        status, age_s = self._statuses.at(available_ns)
-        parts: list[RecordPart] = [
-            repeat_text(b'{"id":', lists * objects),
-            encode_texts(names).at(np.tile(np.arange(objects), lists)),
-            repeat_text(b',"status":', lists * objects),
-            encode_texts(STATUSES).at(status.ravel()),
-            repeat_text(b',"age_s":', lists * objects),
-            encode_numbers(age_s.ravel(), lists * objects),
-            repeat_text(b"}", lists * objects),
-        ]
-        whole: list[RecordPart] = [
-            repeat_text(b'{"available_ns":', lists),
-            encode_numbers(available_ns, lists),
-            repeat_text(b',"objects":', lists),
-            *encode_arrays(np.arange(lists + 1) * objects, parts),
-            repeat_text(b"}", lists),
-        ]
-        yield from encode_records(whole, lists)
+        yield from self._encode(available_ns, self._statuses.at(available_ns))
 
 
 # Faults of the units' lists.
@@ -195,11 +188,10 @@ DETAIL_JSON = _describe_messages(
 )
 
 
-def _encode_captures(captured_ns: Int) -> list[RecordPart]:
+def _stated_captures(captured_ns: Int) -> StatedRows:
     """Stamps, null where there is no capture."""
-    known = start_offsets(captured_ns != NO_CAPTURE_NS)
-    stamps = encode_numbers(captured_ns[np.diff(known) > 0], int(known[-1]))
-    return [RowGroups(known, [stamps]), TextPool.of([b"null", b""]).at(np.diff(known))]
+    known = captured_ns != NO_CAPTURE_NS
+    return StatedRows(known, captured_ns[known])
 
 
 class DetailWriter:
@@ -218,7 +210,7 @@ class DetailWriter:
     ) -> None:
         self._fused_tracks, self._events, self._t0_ns = fused_tracks, events, scene.t0_ns
         names, self._name = fused_tracks.names_of(scene)
-        self._names, self._units = encode_texts(names), encode_texts(fused_tracks.received.units)
+        self._names, self._units = (TextPool.of(of) for of in (names, fused_tracks.received.units))
         self._faults = faults_by_list(fused_tracks)
         self._sizes_of = np.zeros(len(self._name), dtype=bool) if sizes_of is None else sizes_of
 
@@ -226,50 +218,30 @@ class DetailWriter:
         """The lists as they became available at these instants of the log's clock, (F,)."""
         rows, bounds = self._fused_tracks.listed_rows
         for first, last in split_into_blocks(bounds):
-            captured_ns, lists = self._fused_tracks.fused.stamp_ns[first:last], last - first
-            start = bounds[first : last + 1] - bounds[first]
-            parts: list[RecordPart] = [
-                repeat_text(b'{"available_ns":', lists),
-                encode_numbers(available_ns[first:last], lists),
-                repeat_text(b',"captured_ns":', lists),
-                *_encode_captures(captured_ns),
-                repeat_text(b',"objects":', lists),
-                *encode_arrays(start, self._objects(rows[bounds[first] : bounds[last]])),
-                TextPool.of([self._besides(frame) for frame in range(first, last)]).at(np.arange(lists)),
-            ]
-            yield from encode_records(parts, lists)
+            objects = self._objects(rows[bounds[first] : bounds[last]])
+            content: JsonContent = {
+                "available_ns": available_ns[first:last],
+                "captured_ns": _stated_captures(self._fused_tracks.fused.stamp_ns[first:last]),
+                "objects": RepeatedMessages(bounds[first : last + 1] - bounds[first], objects),
+            }
+            for frame, message in enumerate(encode_json(content, last - first), start=first):
+                yield message[:-1] + self._besides(frame)
 
-    def _objects(self, rows: Int) -> list[RecordPart]:
-        """The parts of the objects of some rows."""
-        fused, claims, count = self._fused_tracks.fused, self._fused_tracks.said, len(rows)
-        parts: list[RecordPart] = [repeat_text(b'{"id":', count), self._names.at(self._name[rows])]
-        if claims is not None:
-            parts += [repeat_text(b',"existence":', count), encode_numbers(claims["existence"][rows], count)]
+    def _objects(self, rows: Int) -> JsonContent:
+        """The objects of some rows."""
+        fused, claims, stated_s = self._fused_tracks.fused, self._fused_tracks.said, self._fused_tracks.stated_s
         sized = self._sizes_of[rows]
-        sides: list[RecordPart] = []
-        for name in ("length_m", "width_m"):
-            values = getattr(fused, name)[0, rows[sized]]
-            sides += [repeat_text(f',"{name}":'.encode(), len(values)), encode_numbers(values, len(values))]
-        parts.append(RowGroups(start_offsets(sized), sides))
-        for name in UNCERTAINTIES:
-            variance = getattr(fused, name)
-            parts += [
-                repeat_text(f',"{name}":'.encode(), count),
-                encode_numbers(None if variance is None else variance[0, rows], count),
-            ]
-        return [*parts, *self._captures(rows), *self._entries(rows), repeat_text(b"}", count)]
-
-    def _captures(self, rows: Int) -> list[RecordPart]:
-        """The parts of the newest captures that the objects of some rows go back to."""
-        newest_s, stated_s = self._fused_tracks.captured_s[0, rows], self._fused_tracks.stated_s
-        parts = [
-            repeat_text(b',"newest_captured_ns":', len(rows)),
-            *_encode_captures(self._stamps(newest_s)),
-        ]
-        if stated_s is not None:
-            stamps_ns = self._stamps(stated_s[rows])
-            parts += [repeat_text(b',"stated_captured_ns":', len(rows)), encode_numbers(stamps_ns, len(rows))]
-        return parts
+        sides = {n: StatedRows(sized, getattr(fused, n)[0, rows[sized]], null=False) for n in ("length_m", "width_m")}
+        spread = {name: getattr(fused, name) for name in UNCERTAINTIES}
+        return {
+            "id": self._names.at(self._name[rows]),
+            **({} if claims is None else {"existence": claims["existence"][rows]}),
+            **(sides if sized.any() else {}),
+            **{name: None if variance is None else variance[0, rows] for name, variance in spread.items()},
+            "newest_captured_ns": _stated_captures(self._stamps(self._fused_tracks.captured_s[0, rows])),
+            **({} if stated_s is None else {"stated_captured_ns": self._stamps(stated_s[rows])}),
+            **self._entries(rows),
+        }
 
     def _stamps(self, captured_s: Float) -> Int:
         """Instants of the log as stamps; −∞ is no capture."""
@@ -277,21 +249,17 @@ class DetailWriter:
         since_ns = np.rint(np.where(known, captured_s, 0.0) * 1e9).astype(np.int64)
         return np.where(known, self._t0_ns + since_ns, NO_CAPTURE_NS)
 
-    def _entries(self, rows: Int) -> list[RecordPart]:
-        """The parts of the entries that the objects of some rows were made of."""
+    def _entries(self, rows: Int) -> JsonContent:
+        """The entries that the objects of some rows were made of."""
         received, view = self._fused_tracks.received, self._fused_tracks.view
         start, places = expand_ranges(self._fused_tracks.used_start, rows)
         used = self._fused_tracks.used[places]
-        columns = {
-            "units": self._units.at(received.row_unit_ix[used]),
-            "captured_ns": encode_numbers(received.stamp_ns[received.frame_ix[used]], len(used)),
-            "range_m": encode_numbers(None if view is None else view.range_m[used], len(used)),
-            "visible_share": encode_numbers(None if view is None else view.visible_share[used], len(used)),
+        return {
+            "units": RepeatedMessages(start, self._units.at(received.row_unit_ix[used])),
+            "captured_ns": RepeatedMessages(start, received.stamp_ns[received.frame_ix[used]]),
+            "range_m": RepeatedMessages(start, None if view is None else view.range_m[used]),
+            "visible_share": RepeatedMessages(start, None if view is None else view.visible_share[used]),
         }
-        parts: list[RecordPart] = []
-        for name, column in columns.items():
-            parts += [repeat_text(f',"{name}":'.encode(), len(rows)), *encode_arrays(start, [column])]
-        return parts
 
     def _besides(self, frame: int) -> bytes:
         """The end of a message: detections with its list, and faults of the units' lists."""

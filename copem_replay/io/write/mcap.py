@@ -40,20 +40,18 @@ from copem_replay.io.window import Window
 from copem_replay.io.write.detail import Event, Statuses
 from copem_replay.io.write.message_family import (
     OSI,
-    OSI_CHANNEL,
     RUN_RECORD,
     TRUTH_TOPICS,
-    Catalogue,
     Family,
     ListWriter,
     OpenedFamily,
     TruthWriter,
     list_extra_topics,
     list_topics,
-    osi_version,
 )
-from copem_replay.io.write.scene import TruthScene
-from copem_replay.io.write.source import RecordingSource, open_source
+from copem_replay.io.write.osi import OSI_VERSION
+from copem_replay.io.write.scene import MovingEntities, TruthScene, draw_moving, transform_content
+from copem_replay.io.write.source import OSI_CHANNEL, Catalogue, RecordingSource, open_source
 
 OSI_RECORD = "net.asam.osi.trace"
 """The one metadata record of an OSI trace file (OSI 3.8, trace file formats)."""
@@ -150,7 +148,7 @@ def _add_records(writer: Writer, original: RecordingSource, osi: bool, manifest:
             writer.add_metadata(name, record)
     writer.add_metadata(RUN_RECORD, dict(sorted(manifest.items())))
     if osi:
-        writer.add_metadata(OSI_RECORD, _osi_record(original, osi_version(), version("protobuf")))
+        writer.add_metadata(OSI_RECORD, _osi_record(original, OSI_VERSION, version("protobuf")))
 
 
 def _encode_chunk(
@@ -171,14 +169,22 @@ def _encode_chunk(
 
 def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
     """The messages of the truth's scene; static entities once, at the start."""
-    messages = (zip(part.time_ns.tolist(), writer.moving(part), strict=True) for part in truth.moving)
-    frames = zip(chain.from_iterable(messages), truth.followed, strict=True)
-    for k, ((time_ns, moving), followed) in enumerate(frames):
-        if k == 0:
-            yield Message(writer.static, time_ns, writer.drawn(truth.static, time_ns), time_ns, 0)
-        yield Message(writer.scene, time_ns, moving, time_ns, 0)
-        if followed is not None:
-            yield Message(writer.transform, time_ns, writer.followed(followed, time_ns, truth.follow), time_ns, 0)
+    frame, encode = 0, writer.encode_transforms
+    for part in truth.moving:
+        poses = truth.followed[frame : frame + len(part.time_ns)]
+        there = np.array([pose is not None for pose in poses], dtype=bool)
+        content = transform_content(
+            writer.frame_id, truth.follow, [pose for pose in poses if pose is not None], part.time_ns[there]
+        )
+        moves = iter(encode(content, int(there.sum())))
+        for time_ns, drawn, followed in zip(part.time_ns.tolist(), draw_moving(part, writer.draw), there, strict=True):
+            if frame == 0:
+                (static,) = draw_moving(MovingEntities.at(time_ns, truth.static), writer.draw)
+                yield Message(writer.static, time_ns, static, time_ns, 0)
+            yield Message(writer.scene, time_ns, drawn, time_ns, 0)
+            if followed:
+                yield Message(writer.transform, time_ns, next(moves), time_ns, 0)
+            frame += 1
 
 
 def _merge_by_time(streams: Sequence[Iterator[Message]]) -> Iterator[Message]:

@@ -2,220 +2,48 @@
 
 OSI: osi3.SensorData, foxglove.SceneUpdate (protobuf), and JSON, for all recordings but those of ROS 2. ROS 2: CDR only,
 since a file of the profile `ros2` holds nothing else.
-
-An MCAP file is copied here, too: every channel, message, metadata record and attachment as it was. A window restricts
-messages only. A sound file is read in order of log time through its index; a damaged one from its start as far as it
-goes, and sorted.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib import import_module
 from importlib.metadata import version
 from typing import Any, Protocol
-
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.writer import Writer
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH, Int, Scene
-from copem_replay.io.containers.mcap_records import (
-    DAMAGE,
-    MAGIC,
-    RecordsFromStart,
-    parse_record,
-    read_by_log_time,
-    read_record_at,
-    read_summary,
-    renumber_message,
+from copem_replay.io.encodings.cdr_bytes import HEAD, encode_cdr
+from copem_replay.io.encodings.column_bytes import (
+    Instants,
+    RepeatedMessages,
+    encode_messages,
 )
 from copem_replay.io.encodings.ros2_types import message_definition
-from copem_replay.io.log import Log, open_file
 from copem_replay.io.recording import Recording
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, load_message_class
-from copem_replay.io.schemas.registry import DETAIL_SCHEMA
-from copem_replay.io.window import is_kept
+from copem_replay.io.schemas.registry import DETAIL_SCHEMA, STRING
 from copem_replay.io.write.detail import (
     DETAIL_JSON,
     STATUS_JSON,
     STATUS_SCHEMA,
-    STATUSES,
     DetailWriter,
     Event,
     Statuses,
     StatusWriter,
+    encode_statuses,
 )
 from copem_replay.io.write.osi import OSI_VERSION, SensorDataWriter
-from copem_replay.io.write.ros2 import (
-    DETECTED_OBJECTS,
-    HEAD,
-    SCENE_UPDATE,
-    STATUS,
-    STRING,
-    TRANSFORM,
-    CdrMessage,
-    DetectedObjectsWriter,
-    Ros2SceneWriter,
-    encode_ros2_moving,
-    encode_ros2_scene,
-    encode_ros2_transform,
-    encode_string,
-)
-from copem_replay.io.write.scene import (
-    FOXGLOVE_SCENE_SCHEMA,
-    FRAME_ID,
-    Ellipses,
-    Entity,
-    FoxgloveSceneWriter,
-    MovingEntities,
-    Pose,
-    UncertaintyWriter,
-    encode_ellipses,
-    encode_moving,
-    encode_scene,
-    encode_transform,
-    load_scene_class,
-    load_transform_class,
-)
+from copem_replay.io.write.ros2 import DETECTED_OBJECTS, DetectedObjectsWriter
+from copem_replay.io.write.scene import FRAME_ID, BoxWriter, Draw, Encode, UncertaintyWriter, draw_scenes
+from copem_replay.io.write.source import OSI_CHANNEL, Catalogue
 
-
-class Catalogue:
-    """Schemas, channels and attachments of a file that is being written: equal ones are written once."""
-
-    def __init__(self, writer: Writer) -> None:
-        self.writer = writer
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._channels: dict[tuple[object, ...], int] = {}
-        self._attached: set[tuple[object, ...]] = set()
-
-    def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """The number of a schema, which is written if it is new."""
-        if (name, encoding, data) not in self._schemas:
-            self._schemas[name, encoding, data] = self.writer.register_schema(name, encoding, data)
-        return self._schemas[name, encoding, data]
-
-    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        """The number of a channel, which is written if it is new."""
-        ordered = dict(sorted(metadata.items()))
-        key = (topic, encoding, schema, tuple(ordered.items()))
-        if key not in self._channels:
-            self._channels[key] = self.writer.register_channel(topic, encoding, schema, ordered)
-        return self._channels[key]
-
-    def attach(self, a: Attachment) -> None:
-        """Write an attachment if it is new."""
-        key = (a.create_time, a.log_time, a.name, a.media_type, a.data)
-        if key not in self._attached:
-            self._attached.add(key)
-            self.writer.add_attachment(*key)
-
-
-class OriginalMcap:
-    """An MCAP file to be copied: its channels and metadata, and its messages on demand.
-
-    `damage` says that not all of it can be copied, None where all can.
-    """
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-        self.damage: str | None = None
-        self.profile = ""
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.channels: dict[int, Channel] = {}
-        self.attachments: list[Attachment] = []
-        self.start_ns = log.start_ns
-        self._schemas: dict[int, Schema] = {}
-        self._by_index = log.indexed and self._look_up()
-        if not self._by_index:
-            self._salvage()
-            if not log.complete or log.indexed:
-                self.damage = "damaged: its messages are copied as far as they can be read"
-
-    def _look_up(self) -> bool:
-        """Whether the file can be copied through its index; all that is copied is read once, since only that tells."""
-        try:
-            with open_file(self._log.path) as file:
-                summary = read_summary(file)
-                if summary is None:
-                    return False
-                header = parse_record(Opcode.HEADER, read_record_at(file, len(MAGIC), Opcode.HEADER))
-                metadata = [
-                    parse_record(Opcode.METADATA, read_record_at(file, index.offset, Opcode.METADATA))
-                    for index in summary.metadata_indexes
-                ]
-                attachments = [
-                    parse_record(Opcode.ATTACHMENT, read_record_at(file, index.offset, Opcode.ATTACHMENT))
-                    for index in summary.attachment_indexes
-                ]
-                for _message in read_by_log_time(file, summary, self._log.spans(summary.channels.keys())):
-                    pass
-        except DAMAGE:
-            return False
-        self.profile = header.profile if isinstance(header, Header) else ""
-        for record in metadata:
-            if isinstance(record, Metadata):
-                self._keep(record)
-        self.attachments = [record for record in attachments if isinstance(record, Attachment)]
-        self._schemas, self.channels = dict(summary.schemas), dict(summary.channels)
-        return True
-
-    def _salvage(self) -> None:
-        with open_file(self._log.path) as file:
-            stream = RecordsFromStart(file)
-            for record in stream:
-                if isinstance(record, Header):
-                    self.profile = record.profile
-                elif isinstance(record, Metadata):
-                    self._keep(record)
-                elif isinstance(record, Attachment):
-                    self.attachments.append(record)
-        self._schemas, self.channels = stream.schemas, stream.channels
-
-    def _keep(self, record: Metadata) -> None:
-        """Keep a metadata record, merged with others of its name: rosbag2 writes one name several times."""
-        self.metadata.setdefault(record.name, {}).update(record.metadata)
-
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        """Put schemas, channels and attachments into the output. Returns the new number of each channel.
-
-        Channels of the topics `without` are left out, with their messages.
-        """
-        numbers: dict[int, int] = {}
-        for number, channel in sorted(self.channels.items()):
-            if channel.topic in without:
-                continue
-            schema = self._schemas.get(channel.schema_id)
-            schema_id = catalogue.schema(schema.name, schema.encoding, schema.data) if schema else 0
-            numbers[number] = catalogue.channel(
-                channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
-            )
-        for attachment in self.attachments:
-            catalogue.attach(attachment)
-        return numbers
-
-    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        """The messages in order of log time, with the channel numbers of the output."""
-        spans = self._log.spans(numbers.keys())
-        with open_file(self._log.path) as file:
-            if self._by_index and (summary := read_summary(file)) is not None:
-                messages = read_by_log_time(file, summary, spans)
-            else:
-                kept = (
-                    r
-                    for r in RecordsFromStart(file)
-                    if isinstance(r, Message) and is_kept(spans, r.channel_id, r.log_time)
-                )
-                messages = iter(sorted(kept, key=lambda message: message.log_time))
-            for message in messages:
-                yield renumber_message(message, numbers)
-
-
-OSI_CHANNEL = "net.asam.osi.trace.channel."
 _NAMELESS = "map"  # name of the world frame where none is given, after REP 105
 
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"
@@ -233,26 +61,6 @@ class ListWriter(Protocol):
         """The lists as they became available at these instants of the log's clock, (F,)."""
 
 
-class OpenedFamily(Protocol):
-    """A family whose schemas are in the file that is being written."""
-
-    osi: bool
-    """Whether osi3 messages are written."""
-
-    def channels(
-        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
-    ) -> dict[int, ListWriter]:
-        """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
-
-    def seen_besides(
-        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
-    ) -> dict[int, ListWriter]:
-        """The channels of a configuration for viewers: `status`, `uncertainty`."""
-
-    def truth(self) -> TruthWriter:
-        """The writer of the truth as a scene of its own."""
-
-
 @dataclass(frozen=True)
 class TruthWriter:
     """The channels of the truth, and how its scenes and the frame to follow become messages of the family."""
@@ -260,12 +68,12 @@ class TruthWriter:
     scene: int
     static: int
     transform: int
-    drawn: Callable[[Sequence[Entity], int], bytes]
-    moving: Callable[[MovingEntities], Iterator[bytes]]
-    followed: Callable[[Pose, int, str], bytes]
+    draw: Draw
+    encode_transforms: Encode
+    frame_id: str
 
 
-Family = Callable[[Catalogue, Scene, Mapping[str, int]], OpenedFamily]
+Family = Callable[[Catalogue, Scene, Mapping[str, int]], "OpenedFamily"]
 """Puts a family's schemas into a file. The last argument: the number of each unit."""
 
 
@@ -294,168 +102,152 @@ EGO_FRAME, MIDDLE_FRAME = "copem_ego", "copem_middle"
 """Frames of reference to follow: one moves with the ego, the other, without an ego, stands in the middle of objects."""
 
 
-def osi_version() -> str:
-    """The version of OSI that is written."""
-    return ".".join(map(str, OSI_VERSION))
+class OpenedFamily(ABC):
+    """A family whose schemas are in the file that is being written; `frame_id`: the frame of reference of scenes."""
 
-
-class _OsiFamily:
-    """osi3.SensorData; foxglove.SceneUpdate in the frame of reference `frame_id`; details as JSON."""
-
-    osi = True
+    osi: bool
+    """Whether osi3 messages are written."""
 
     def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str = FRAME_ID) -> None:
         self._catalogue, self._scene, self._units, self._frame_id = catalogue, scene, units, frame_id
-        self._objects = _add_protobuf_channel(catalogue, load_message_class(SENSOR_DATA), SENSOR_DATA)
-        self._scenes = _add_protobuf_channel(catalogue, load_scene_class(), FOXGLOVE_SCENE_SCHEMA)
-        self._details = catalogue.schema(DETAIL_SCHEMA, "jsonschema", json.dumps(DETAIL_JSON).encode())
+        self._draw: Draw = partial(draw_scenes, self._encoder("scene"), frame_id)
+        for kind in ("objects", "scene", "detail"):
+            self._schema(kind)
+
+    @abstractmethod
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+        """What a channel of a kind of message has: encoding, number of the schema, which is written, metadata."""
+
+    @abstractmethod
+    def _encoder(self, kind: str) -> Encode:
+        """Makes messages of a kind, `scene` or `transform`."""
+
+    @abstractmethod
+    def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
+        """The writers of the lists, and of their details."""
+
+    @staticmethod
+    @abstractmethod
+    def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+        """Messages of the statuses at each instant."""
+
+    def _channel(self, topic: str, kind: str, configuration: str = "") -> int:
+        """The number of a channel."""
+        return self._catalogue.channel(topic, *self._schema(kind, configuration))
 
     def channels(
         self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
     ) -> dict[int, ListWriter]:
-        description = {
-            f"{OSI_CHANNEL}description": f"fused object list of configuration {name}",
-            f"{OSI_CHANNEL}osi_version": osi_version(),
+        """The channels of a configuration: `objects`, `scene`, `detail`, in this order."""
+        objects, details = self._objects(fused_tracks, events)
+        writers = objects, BoxWriter(self._scene, fused_tracks, name, colour, self._draw), details
+        kinds = zip(list_topics(name), ("objects", "scene", "detail"), strict=True)
+        return dict(zip((self._channel(topic, kind, name) for topic, kind in kinds), writers, strict=True))
+
+    def seen_besides(
+        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
+    ) -> dict[int, ListWriter]:
+        """The channels of a configuration for viewers: `status`, `uncertainty`."""
+        status, uncertainty = list_extra_topics(name)
+        ellipses = UncertaintyWriter(self._scene, fused_tracks, colour, self._draw)
+        return {
+            self._channel(status, "status"): StatusWriter(statuses, self.encode_statuses),
+            self._channel(uncertainty, "scene"): ellipses,
+        }
+
+    def truth(self) -> TruthWriter:
+        """The writer of the truth as a scene of its own."""
+        self._schema("transform")
+        kinds = zip(TRUTH_TOPICS, ("scene", "scene", "transform"), strict=True)
+        scene, static, transform = (self._channel(topic, kind) for topic, kind in kinds)
+        return TruthWriter(scene, static, transform, self._draw, self._encoder("transform"), self._frame_id)
+
+
+class _OsiFamily(OpenedFamily):
+    """osi3.SensorData; foxglove.SceneUpdate; details and statuses as JSON."""
+
+    osi = True
+    encode_statuses = staticmethod(encode_statuses)
+
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+        if kind in ("detail", "status"):
+            name, schema = (DETAIL_SCHEMA, DETAIL_JSON) if kind == "detail" else (STATUS_SCHEMA, STATUS_JSON)
+            return "json", self._catalogue.schema(name, "jsonschema", json.dumps(schema).encode()), {}
+        described = _load_class(kind).DESCRIPTOR.full_name, "protobuf", _describe_class(_load_class(kind))
+        about = {
+            f"{OSI_CHANNEL}description": f"fused object list of configuration {configuration}",
+            f"{OSI_CHANNEL}osi_version": OSI_VERSION,
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
-        objects, scenes, details = list_topics(name)
-        channel, scene = self._catalogue.channel, self._scene
-        return {
-            channel(objects, "protobuf", self._objects, description): SensorDataWriter(
-                scene, fused_tracks, self._units
-            ),
-            channel(scenes, "protobuf", self._scenes, {}): FoxgloveSceneWriter(
-                scene, fused_tracks, name, colour, self._frame_id
-            ),
-            channel(details, "json", self._details, {}): DetailWriter(scene, fused_tracks, events),
-        }
+        return "protobuf", self._catalogue.schema(*described), about if kind == "objects" else {}
 
-    def seen_besides(
-        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
-    ) -> dict[int, ListWriter]:
-        catalogue, (status, uncertainty) = self._catalogue, list_extra_topics(name)
-        schema = catalogue.schema(STATUS_SCHEMA, "jsonschema", json.dumps(STATUS_JSON).encode())
-        return {
-            catalogue.channel(status, "json", schema, {}): StatusWriter(statuses),
-            catalogue.channel(uncertainty, "protobuf", self._scenes, {}): UncertaintyWriter(
-                self._scene, fused_tracks, colour, partial(encode_ellipses, frame_id=self._frame_id)
-            ),
-        }
+    def _encoder(self, kind: str) -> Encode:
+        return partial(encode_messages, _load_class(kind).DESCRIPTOR)
 
-    def truth(self) -> TruthWriter:
-        moves = _add_protobuf_channel(self._catalogue, load_transform_class(), "foxglove.FrameTransform")
-        schemas = zip(TRUTH_TOPICS, (self._scenes, self._scenes, moves), strict=True)
-        scene, static, ego = (self._catalogue.channel(topic, "protobuf", schema, {}) for topic, schema in schemas)
-        placed = partial(encode_transform, self._frame_id)
-        drawn, moving = partial(encode_scene, frame_id=self._frame_id), partial(encode_moving, frame_id=self._frame_id)
-        return TruthWriter(scene, static, ego, drawn, moving, placed)
-
-
-class _Ros2Family:
-    """autoware_perception_msgs/DetectedObjects and foxglove_msgs/SceneUpdate in the frame of reference `frame_id`; the
-    JSON of the details as std_msgs/String.
-    """
-
-    osi = False
-
-    def __init__(self, catalogue: Catalogue, scene: Scene, units: Mapping[str, int], frame_id: str) -> None:
-        self._catalogue, self._scene, self._frame_id = catalogue, scene, frame_id
-        self._schemas = [
-            catalogue.schema(name, "ros2msg", message_definition(name))
-            for name in (DETECTED_OBJECTS, SCENE_UPDATE, STRING)
-        ]
-
-    def channels(
-        self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
-    ) -> dict[int, ListWriter]:
-        scene, frame_id = self._scene, self._frame_id
-        objects = DetectedObjectsWriter(scene, fused_tracks, frame_id)
-        details = DetailWriter(scene, fused_tracks, events, sizes_of=objects.round)
-        writers: list[ListWriter] = [
-            _SingleListEncoder(objects.message),
-            _SingleListEncoder(Ros2SceneWriter(scene, fused_tracks, name, colour, frame_id).message),
-            _StringEncoder(details),
-        ]
-        numbers = [
-            self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
-            for topic, schema in zip(list_topics(name), self._schemas, strict=True)
-        ]
-        return dict(zip(numbers, writers, strict=True))
-
-    def seen_besides(
-        self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
-    ) -> dict[int, ListWriter]:
-        schemas = self._catalogue.schema(STATUS, "ros2msg", message_definition(STATUS)), self._schemas[1]
-        numbers = [self._channel(topic, schema) for topic, schema in zip(list_extra_topics(name), schemas, strict=True)]
-        uncertainty = UncertaintyWriter(self._scene, fused_tracks, colour, self._ellipses)
-        writers: list[ListWriter] = [_StatusEncoder(statuses), uncertainty]
-        return dict(zip(numbers, writers, strict=True))
-
-    def truth(self) -> TruthWriter:
-        moves = self._catalogue.schema(TRANSFORM, "ros2msg", message_definition(TRANSFORM))
-        schemas = zip(TRUTH_TOPICS, (self._schemas[1], self._schemas[1], moves), strict=True)
-        scene, static, ego = (self._channel(topic, schema) for topic, schema in schemas)
-        placed = partial(encode_ros2_transform, self._frame_id)
-        moving = partial(encode_ros2_moving, frame_id=self._frame_id)
-        return TruthWriter(scene, static, ego, self.drawn, moving, placed)
-
-    def drawn(self, entities: Sequence[Entity], time_ns: int) -> bytes:
-        return encode_ros2_scene(entities, time_ns, self._frame_id)
-
-    def _ellipses(self, ellipses: Ellipses, time_ns: Int, start: Int) -> Iterator[bytes]:
-        every = ellipses.entities()
-        for k, at_ns in enumerate(time_ns.tolist()):
-            yield self.drawn(every[start[k] : start[k + 1]], at_ns)
-
-    def _channel(self, topic: str, schema: int) -> int:
-        return self._catalogue.channel(topic, "cdr", schema, {"offered_qos_profiles": QOS})
+    def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
+        scene = self._scene
+        return [SensorDataWriter(scene, fused_tracks, self._units), DetailWriter(scene, fused_tracks, events)]
 
 
 OSI: Family = _OsiFamily
 """The family of all recordings but those of ROS 2."""
 
 
-class _StatusEncoder:
-    """Statuses as copem_replay_msgs/Status."""
-
-    def __init__(self, statuses: Statuses) -> None:
-        self._statuses = statuses
-
-    def messages(self, available_ns: Int) -> Iterator[bytes]:
-        status, age_s = self._statuses.at(available_ns)
-        for time_ns, each, ages in zip(available_ns.tolist(), status.tolist(), age_s.tolist(), strict=True):
-            out = CdrMessage()
-            out.stamp(time_ns)
-            out.add("I", len(each))
-            for name, which, age in zip(self._statuses.names, each, ages, strict=True):
-                out.text(name)
-                out.text(STATUSES[which])
-                out.add("d", age)
-            yield out.message()
+def _load_class(kind: str) -> Any:
+    """The class of `objects`, `scene` or `transform` in protobuf, imported when first needed."""
+    if kind == "objects":
+        return load_message_class(SENSOR_DATA)
+    name = "SceneUpdate" if kind == "scene" else "FrameTransform"
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
 
 
-class _StringEncoder:
+@cache
+def _describe_class(message_class: Any) -> bytes:
+    from mcap_protobuf.schema import build_file_descriptor_set
+
+    described: bytes = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
+    return described
+
+
+_ROS2_TYPES = {
+    "objects": DETECTED_OBJECTS,
+    "scene": "foxglove_msgs/msg/SceneUpdate",
+    "detail": STRING,
+    "status": "copem_replay_msgs/msg/Status",
+    "transform": "foxglove_msgs/msg/FrameTransform",
+}
+
+
+class _Ros2Family(OpenedFamily):
+    """autoware_perception_msgs/DetectedObjects; foxglove_msgs/SceneUpdate; JSON of details as std_msgs/String."""
+
+    osi = False
+
+    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+        described = _ROS2_TYPES[kind], "ros2msg", message_definition(_ROS2_TYPES[kind])
+        return "cdr", self._catalogue.schema(*described), {"offered_qos_profiles": QOS}
+
+    def _encoder(self, kind: str) -> Encode:
+        return partial(encode_cdr, _ROS2_TYPES[kind])
+
+    def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
+        objects = DetectedObjectsWriter(self._scene, fused_tracks, self._frame_id)
+        return [objects, _StringWriter(DetailWriter(self._scene, fused_tracks, events, sizes_of=objects.round))]
+
+    @staticmethod
+    def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
+        """Messages of copem_replay_msgs/Status."""
+        return encode_cdr(
+            _ROS2_TYPES["status"], {"stamp": Instants(available_ns), "objects": objects}, len(available_ns)
+        )
+
+
+class _StringWriter:
     """Messages of JSON as std_msgs/String."""
 
     def __init__(self, writer: ListWriter) -> None:
         self._writer = writer
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        return (HEAD + encode_string(data.decode()) for data in self._writer.messages(available_ns))
-
-
-class _SingleListEncoder:
-    """Messages made one at a time, from the number of a list and its instant."""
-
-    def __init__(self, message: Callable[[int, int], bytes]) -> None:
-        self._message = message
-
-    def messages(self, available_ns: Int) -> Iterator[bytes]:
-        return (self._message(frame, time_ns) for frame, time_ns in enumerate(available_ns.tolist()))
-
-
-def _add_protobuf_channel(catalogue: Catalogue, message_class: Any, name: str) -> int:
-    from mcap_protobuf.schema import build_file_descriptor_set
-
-    data = build_file_descriptor_set(message_class).SerializeToString(deterministic=True)
-    return catalogue.schema(name, "protobuf", data)
+        messages = self._writer.messages(available_ns)
+        return (HEAD + struct.pack("<I", len(data) + 1) + data + b"\0" for data in messages)

@@ -29,6 +29,7 @@ from copem_replay.core.site_map import SiteMap, outline_crosswalks
 from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, Float, Int, Scene
 from copem_replay.io.encodings.column_bytes import (
     Content,
+    Instants,
     RepeatedMessages,
     encode_messages,
     expand_ranges,
@@ -152,7 +153,8 @@ def _write_content(writer: Writer, trace: OsiTrace) -> None:
 
 # Fused lists.
 
-OSI_VERSION = (3, 8, 0)
+OSI_VERSION = "3.8.0"
+"""The version of OSI that is written."""
 
 # osi_object.proto: MovingObject.Type and MovingObject.VehicleClassification.Type by class; −1: not a vehicle
 _OSI_TYPE: dict[str, tuple[int, int]] = {
@@ -197,16 +199,18 @@ class SensorDataWriter:
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
         rows, bounds = self._fused_tracks.listed_rows
-        version = dict(zip(("version_major", "version_minor", "version_patch"), OSI_VERSION, strict=True))
+        version = dict(
+            zip(("version_major", "version_minor", "version_patch"), map(int, OSI_VERSION.split(".")), strict=True)
+        )
         for first, last in split_into_blocks(bounds):
             listed, lists = rows[bounds[first] : bounds[last]], np.diff(bounds[first : last + 1])
             captured_ns = self._fused_tracks.fused.stamp_ns[first:last]
             content: dict[str, Any] = {
                 "version": version,
-                "timestamp": _encode_stamp(available_ns[first:last]),
+                "timestamp": Instants(available_ns[first:last]),
                 "mounting_position": {"position": {}, "orientation": {}},
                 "last_measurement_time": optional_message(
-                    captured_ns != NO_CAPTURE_NS, _encode_stamp(captured_ns[captured_ns != NO_CAPTURE_NS])
+                    captured_ns != NO_CAPTURE_NS, Instants(captured_ns[captured_ns != NO_CAPTURE_NS])
                 ),
             }
             frame = np.repeat(np.arange(len(lists)), lists)
@@ -283,8 +287,3 @@ def _standard_deviation(variance: Float | None, rows: Int) -> Float:
     """Standard deviations of `rows`, 0 where the state is exact."""
     result: Float = np.zeros(len(rows)) if variance is None else np.sqrt(np.nan_to_num(variance[0, rows]))
     return result
-
-
-def _encode_stamp(time_ns: Int) -> Content:
-    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
-    return {"seconds": seconds, "nanos": nanos}

@@ -1,16 +1,15 @@
-"""Scenes for Foxglove and Lichtblick: boxes of fused lists, ellipses of uncertainty, and the truth, in protobuf as
-foxglove.SceneUpdate; their messages in ROS 2 are in `ros2.py`.
+"""Scenes for Foxglove and Lichtblick: boxes of fused lists, ellipses of uncertainty, and the truth.
 
-Every message deletes all that was on its topic and draws anew, so playback shows the right boxes after a seek and
-nothing accumulates (entities replace by id and live until deleted).
+They are said once, as content of foxglove.SceneUpdate, whose fields protobuf and ROS 2 have in common; `Draw` makes
+messages of a family of it. Every message deletes all that was on its topic and draws anew, so playback shows the right
+boxes after a seek and nothing accumulates (entities replace by id and live until deleted).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,9 +18,10 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene
 from copem_replay.io.encodings.column_bytes import (
     Content,
+    Instants,
+    MessagePool,
     RepeatedMessages,
     TextPool,
-    encode_messages,
     expand_ranges,
     optional_message,
     repeat_text,
@@ -35,8 +35,7 @@ Rgba: TypeAlias = tuple[float, float, float, float]
 Place: TypeAlias = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Pose:
+class Pose(NamedTuple):
     """A place in the frame of reference, m, and a turn about the vertical, rad."""
 
     x_m: float = 0.0
@@ -64,10 +63,6 @@ class Text:
     colour: Rgba
     above_m: tuple[float, ...] = ()
     size: float = 14.0
-
-    def place(self, pose: Pose) -> Pose:
-        """Where it is when its entity has a pose."""
-        return Pose(pose.x_m, pose.y_m, sum(self.above_m, start=pose.z_m))
 
 
 @dataclass(frozen=True)
@@ -110,6 +105,13 @@ class MovingEntities:
     z_m: Float
     yaw_rad: Float
 
+    @classmethod
+    def at(cls, time_ns: int, entities: Sequence[Entity]) -> MovingEntities:
+        """One frame of entities at their poses."""
+        poses = np.array([each.pose for each in entities]).reshape(-1, 4)
+        rows = len(entities)
+        return cls(entities, np.array([time_ns]), np.array([0, rows]), np.arange(rows), *poses.T)
+
 
 @dataclass(frozen=True)
 class TruthScene:
@@ -131,55 +133,23 @@ FRESH_ALPHA, OLDEST_ALPHA, FADES_S = 0.6, 0.15, 1.0
 """Opacity of an ellipse: that of a fresh entry, the least, and the age of the least in s; only the picture changes."""
 SMALLEST_M = 0.01
 """Smaller standard deviations are not drawn: their ellipses would be points."""
-
-
-@dataclass(frozen=True)
-class Ellipses:
-    """Upright elliptic cylinders, (N,): names, ages of the entries (`""`: unknown), places, sizes, opacity."""
-
-    names: list[str]
-    ages: list[str]
-    x_m: Float
-    y_m: Float
-    z_m: Float
-    yaw_rad: Float
-    length_m: Float
-    width_m: Float
-    alpha: Float
-    colour: tuple[float, float, float]
-    height_m: float = 0.02
-
-    def entities(self) -> list[Entity]:
-        """An entity for each ellipse."""
-        numbers = (getattr(self, n).tolist() for n in ("x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "alpha"))
-        return [
-            Entity(
-                name,
-                {"age_s": age} if age else {},
-                ellipses=[Ellipse((length, width, self.height_m), (*self.colour, alpha))],
-                pose=Pose(x, y, z, yaw),
-            )
-            for name, age, x, y, z, yaw, length, width, alpha in zip(self.names, self.ages, *numbers, strict=True)
-        ]
-
-
-Encode = Callable[[Ellipses, Int, Int], Iterable[bytes]]
-"""Makes K messages from all ellipses, the instants (K,), and the first ellipse of each instant (K + 1,)."""
+DISC_M = 0.02
+"""Height of an ellipse."""
 
 
 class UncertaintyWriter:
     """Turns the fused lists of one run (values (1, P)) into scenes of ellipses, many lists at once."""
 
-    def __init__(self, scene: Scene, fused_tracks: FusedTracks, colour: Rgb, encode: Encode) -> None:
-        self._t0_ns, self._fused_tracks, self._encode = scene.t0_ns, fused_tracks, encode
-        self._colour = colour[0] / 255, colour[1] / 255, colour[2] / 255
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, colour: Rgb, draw: Draw) -> None:
+        self._t0_ns, self._fused_tracks, self._draw, self._colour = scene.t0_ns, fused_tracks, draw, colour
         fused, rows = fused_tracks.fused, len(fused_tracks.fused.frame_ix)
         ee, en, nn = (
             np.zeros(rows) if c is None else np.asarray(c[0], dtype=float)
             for c in (fused.cov_ee_m2, fused.cov_en_m2, fused.cov_nn_m2)
         )
         self._major, self._minor, self._yaw_rad = principal_axes(ee, en, nn)
-        self._names, self._name = fused_tracks.names_of(scene)
+        names, self._name = fused_tracks.names_of(scene)
+        self._names = TextPool.of(names)
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
@@ -189,23 +159,29 @@ class UncertaintyWriter:
         for first, last in split_into_blocks(bounds):
             time_ns, start = available_ns[first:last], bounds[first : last + 1] - bounds[first]
             available_s = np.repeat((time_ns - self._t0_ns) * 1e-9, np.diff(start))
-            yield from self._encode(self._ellipses(rows[bounds[first] : bounds[last]], available_s), time_ns, start)
+            yield from self._draw(time_ns, start, self._ellipses(rows[bounds[first] : bounds[last]], available_s))
 
-    def _ellipses(self, rows: Int, available_s: Float) -> Ellipses:
+    def _ellipses(self, rows: Int, available_s: Float) -> Content:
         fused = self._fused_tracks.fused
         age_s = np.fmax(0.0, available_s - self._fused_tracks.captured_s[0, rows])
-        return Ellipses(
-            names=[self._names[k] for k in self._name[rows].tolist()],
-            ages=[f"{age:.3f}" if math.isfinite(age) else "" for age in age_s.tolist()],
-            x_m=fused.x_m[0, rows],
-            y_m=fused.y_m[0, rows],
-            z_m=fused.z_m[0, rows] - fused.height_m[0, rows] / 2,  # on the ground
-            yaw_rad=self._yaw_rad[rows],
-            length_m=2 * SIGMAS * self._major[rows],
-            width_m=2 * SIGMAS * self._minor[rows],
-            alpha=FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * np.minimum(age_s / FADES_S, 1.0),
-            colour=self._colour,
-        )
+        known = np.isfinite(age_s)
+        ages = TextPool.of([f"{age:.3f}" for age in age_s[known].tolist()])
+        x, y, z, height = (getattr(fused, name)[0, rows] for name in ("x_m", "y_m", "z_m", "height_m"))
+        alpha = FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * np.minimum(age_s / FADES_S, 1.0)
+        cylinder: Content = {
+            "pose": pose_content(x, y, z - height / 2, self._yaw_rad[rows]),  # on the ground
+            "size": {"x": 2 * SIGMAS * self._major[rows], "y": 2 * SIGMAS * self._minor[rows], "z": DISC_M},
+            "bottom_scale": 1.0,
+            "top_scale": 1.0,
+            "color": shade_content(self._colour, alpha),
+        }
+        return {
+            "id": self._names.at(self._name[rows]),
+            "metadata": optional_message(
+                known, {"key": repeat_text(b"age_s", int(known.sum())), "value": ages.at(np.arange(known.sum()))}
+            ),
+            "cylinders": RepeatedMessages(np.arange(len(rows) + 1), cylinder),
+        }
 
 
 def principal_axes(ee: Float, en: Float, nn: Float) -> tuple[Float, Float, Float]:
@@ -214,39 +190,71 @@ def principal_axes(ee: Float, en: Float, nn: Float) -> tuple[Float, Float, Float
     return np.sqrt(middle + half), np.sqrt(np.maximum(middle - half, 0.0)), np.arctan2(2 * en, ee - nn) / 2
 
 
-# Scenes in protobuf.
+# Content of scenes.
 
-FOXGLOVE_SCENE_SCHEMA = "foxglove.SceneUpdate"
 FRAME_ID = "global"
 """Name of the world frame in the OSI converters of these viewers."""
 ALPHA = 0.5
 """Opacity of boxes: what is inside stays visible."""
 
-
-def load_scene_class() -> Any:
-    """The SceneUpdate class, imported when first needed."""
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
-    return SceneUpdate
+Encode: TypeAlias = Callable[[Content, int], list[bytes]]
+"""Makes messages of one type from their content, in K rows."""
+Draw: TypeAlias = Callable[[Int, Int, Content], list[bytes]]
+"""Makes K scenes of all entities, from the instants (K,) and the first entity of each instant (K + 1,)."""
 
 
-class FoxgloveSceneWriter:
-    """Turns the fused lists of one run (values (1, P)) into messages, many lists at once."""
+def draw_scenes(encode: Encode, frame_id: str, time_ns: Int, start: Int, entities: Content) -> list[bytes]:
+    """`Draw` in a frame of reference: messages that delete all on their topic and draw anew."""
+    drawn: Content = {
+        "timestamp": Instants(np.repeat(time_ns, np.diff(start))),
+        "frame_id": repeat_text(frame_id, int(start[-1])),
+        **entities,
+    }
+    deletion: Content = {"timestamp": Instants(time_ns), "type": 1}  # ALL
+    content: Content = {
+        "deletions": RepeatedMessages(np.arange(len(time_ns) + 1), deletion),
+        "entities": RepeatedMessages(start, drawn),
+    }
+    return encode(content, len(time_ns))
 
-    def __init__(
-        self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, frame_id: str = FRAME_ID
-    ) -> None:
-        self._fused, self._rows, self._frame_id = fused_tracks.fused, fused_tracks.listed_rows, frame_id
+
+def pose_content(x_m: Float, y_m: Float, z_m: Float, yaw_rad: Float) -> Content:
+    """Places, and turns about the vertical as quaternions."""
+    turn: Content = {"z": np.sin(yaw_rad / 2), "w": np.cos(yaw_rad / 2)}
+    return {"position": {"x": x_m, "y": y_m, "z": z_m}, "orientation": turn}
+
+
+def shade_content(colour: Rgb, alpha: float | Float) -> Content:
+    """A colour."""
+    red, green, blue = colour
+    return {"r": red / 255, "g": green / 255, "b": blue / 255, "a": alpha}
+
+
+def _pool_metadata(metadata: Sequence[Mapping[str, str]]) -> MessagePool:
+    """The metadata of entities, to choose from."""
+    pairs = [pair for each in metadata for pair in each.items()]
+    keys, values = (TextPool.of([pair[k] for pair in pairs]).at(np.arange(len(pairs))) for k in (0, 1))
+    return MessagePool(start_offsets(_count(metadata)), {"key": keys, "value": values})
+
+
+def _count(groups: Sequence[Sized]) -> Int:
+    return np.array([len(group) for group in groups], dtype=np.int64)
+
+
+class BoxWriter:
+    """Turns the fused lists of one run (values (1, P)) into scenes of boxes, many lists at once."""
+
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, configuration: str, colour: Rgb, draw: Draw) -> None:
+        self._fused, self._rows, self._draw = fused_tracks.fused, fused_tracks.listed_rows, draw
         names, self._name = fused_tracks.names_of(scene)
-        self._names = TextPool.of([name.encode() for name in names])
-        # The metadata of boxes are encoded once for every pair of name and class.
+        self._names = TextPool.of(names)
+        # Each pair of a name and a class has metadata, which a viewer shows for a selected box.
         keys, self._key = np.unique(self._name * len(CLASSES) + fused_tracks.class_of(scene), return_inverse=True)
         pairs = (divmod(key, len(CLASSES)) for key in keys.tolist())
-        self._says = TextPool.of(
-            [_encode_metadata(box_metadata(names[name], kind, configuration)) for name, kind in pairs]
+        self._says = _pool_metadata(
+            [{"configuration": configuration, "class": CLASSES[kind], "object": names[name]} for name, kind in pairs]
         )
-        shades = zip("rgb", colour, strict=True)
-        self._colour: Content = {**{shade: c / 255 for shade, c in shades}, "a": ALPHA}
+        self._colour = shade_content(colour, ALPHA)
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
@@ -258,136 +266,40 @@ class FoxgloveSceneWriter:
                 "metadata": self._says.at(self._key[rows]),
                 "cubes": RepeatedMessages(np.arange(len(rows) + 1), self._cubes(rows)),
             }
-            yield from encode_updates(available_ns[first:last], bounds - bounds[0], entities, self._frame_id)
+            yield from self._draw(available_ns[first:last], bounds - bounds[0], entities)
 
     def _cubes(self, rows: Int) -> Content:
         x, y, z, length, width, height, yaw = (
             getattr(self._fused, name)[0, rows]
             for name in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
         )
-        pose: Content = {"position": {"x": x, "y": y, "z": z}, "orientation": encode_orientation(yaw)}
-        return {"pose": pose, "size": {"x": length, "y": width, "z": height}, "color": self._colour}
+        size: Content = {"x": length, "y": width, "z": height}
+        return {"pose": pose_content(x, y, z, yaw), "size": size, "color": self._colour}
 
 
-def encode_orientation(yaw_rad: Float) -> Content:
-    """The quaternion of a turn about the vertical."""
-    return {"z": np.sin(yaw_rad / 2), "w": np.cos(yaw_rad / 2)}
-
-
-def encode_updates(time_ns: Int, start: Int, entities: Content, frame_id: str) -> list[bytes]:
-    """Messages that delete all on their topic; message k draws the entities `start[k]:start[k + 1]`."""
-    rows = int(start[-1])
-    deletion: Content = {"timestamp": _encode_stamp(time_ns), "type": 1}  # ALL
-    drawn: Content = {
-        "timestamp": _encode_stamp(np.repeat(time_ns, np.diff(start))),
-        "frame_id": repeat_text(frame_id.encode(), rows),
-        **entities,
-    }
-    content: Content = {
-        "deletions": RepeatedMessages(np.arange(len(time_ns) + 1), deletion),
-        "entities": RepeatedMessages(start, drawn),
-    }
-    return encode_messages(load_scene_class().DESCRIPTOR, content, len(time_ns))
-
-
-def encode_ellipses(drawn: Ellipses, time_ns: Int, start: Int, frame_id: str) -> list[bytes]:
-    """Messages of ellipses; message k draws the ellipses `start[k]:start[k + 1]`."""
-    rows = np.arange(len(drawn.names) + 1)
-    ages = [age.encode() for age in drawn.ages if age]
-    age: Content = {"key": repeat_text(b"age_s", len(ages)), "value": TextPool.of(ages).at(np.arange(len(ages)))}
-    red, green, blue = drawn.colour
-    cylinder: Content = {
-        "pose": {
-            "position": {"x": drawn.x_m, "y": drawn.y_m, "z": drawn.z_m},
-            "orientation": encode_orientation(drawn.yaw_rad),
-        },
-        "size": {"x": drawn.length_m, "y": drawn.width_m, "z": drawn.height_m},
-        "bottom_scale": 1.0,
-        "top_scale": 1.0,
-        "color": {"r": red, "g": green, "b": blue, "a": drawn.alpha},
-    }
-    entities: Content = {
-        "id": TextPool.of([name.encode() for name in drawn.names]).at(rows[:-1]),
-        "metadata": optional_message(np.array([age != "" for age in drawn.ages], dtype=bool), age),
-        "cylinders": RepeatedMessages(rows, cylinder),
-    }
-    return encode_updates(time_ns, start, entities, frame_id)
-
-
-def _encode_stamp(time_ns: Int) -> Content:
-    seconds, nanos = np.divmod(time_ns, 1_000_000_000)
-    return {"seconds": seconds, "nanos": nanos}
-
-
-def box_metadata(name: str, class_ix: int, configuration: str) -> dict[str, str]:
-    """The metadata of a box, which a viewer shows for a selected box."""
-    return {"configuration": configuration, "class": CLASSES[class_ix], "object": name}
-
-
-def _encode_metadata(metadata: Mapping[str, str]) -> bytes:
-    """Metadata as encoded fields of a SceneEntity."""
-    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
-
-    entity = SceneEntity()
-    for key, text in metadata.items():
-        entity.metadata.add(key=key, value=text)
-    encoded: bytes = entity.SerializeToString(deterministic=True)
-    return encoded
-
-
-def encode_scene(entities: Sequence[Entity], time_ns: int, frame_id: str) -> bytes:
-    """A message that deletes all on its topic and draws entities."""
-    from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
-
-    update = load_scene_class()()
-    deletion = update.deletions.add()
-    deletion.type = SceneEntityDeletion.ALL
-    deletion.timestamp.FromNanoseconds(time_ns)
-    for each in entities:
-        entity = update.entities.add(frame_id=frame_id, id=each.name)
-        entity.timestamp.CopyFrom(deletion.timestamp)
-        for key, value in each.says.items():
-            entity.metadata.add(key=key, value=value)
-        for ellipse in each.ellipses:
-            element = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
-            element.size.x, element.size.y, element.size.z = ellipse.size
-            _place_primitive(element, each.pose, ellipse.colour)
-        for line in each.lines:
-            element = entity.lines.add(thickness=line.width, scale_invariant=True)
-            for x, y, z in line.points:
-                element.points.add(x=x, y=y, z=z)
-            _place_primitive(element, each.pose, line.colour)
-        for text in each.texts:
-            element = entity.texts.add(billboard=True, font_size=text.size, scale_invariant=True, text=text.text)
-            _place_primitive(element, text.place(each.pose), text.colour)
-    encoded: bytes = update.SerializeToString(deterministic=True)
-    return encoded
-
-
-def encode_moving(moving: MovingEntities, frame_id: str) -> Iterator[bytes]:
-    """A message for each frame, as `encode_scene` gives it, many at once."""
-    looks = _EncodedLooks(moving.looks)
+def draw_moving(moving: MovingEntities, draw: Draw) -> Iterator[bytes]:
+    """A message for each frame, many at once."""
+    looks = _Looks(moving.looks)
     for first, last in split_into_blocks(moving.start):
         bounds = moving.start[first : last + 1]
         entities = looks.content(moving, slice(bounds[0], bounds[-1]))
-        yield from encode_updates(moving.time_ns[first:last], bounds - bounds[0], entities, frame_id)
+        yield from draw(moving.time_ns[first:last], bounds - bounds[0], entities)
 
 
-class _EncodedLooks:
-    """What entities look like, encoded once; elements of all looks are numbered, (E,)."""
+class _Looks:
+    """What entities look like, to choose from; elements of all looks are numbered, (E,)."""
 
     def __init__(self, looks: Sequence[Entity]) -> None:
-        self._names = TextPool.of([look.name.encode() for look in looks])
-        self._says = TextPool.of([_encode_metadata(look.says) for look in looks])
-        self._first = {
-            kind: start_offsets(np.array([len(getattr(look, kind)) for look in looks], dtype=np.int64))
-            for kind in _ELEMENTS
-        }
+        self._names = TextPool.of([look.name for look in looks])
+        self._says = _pool_metadata([look.says for look in looks])
+        self._first = {kind: start_offsets(_count([getattr(look, kind) for look in looks])) for kind in _ELEMENTS}
         self._lines = [line for look in looks for line in look.lines]
         self._texts = [text for look in looks for text in look.texts]
         self._ellipses = [ellipse for look in looks for ellipse in look.ellipses]
-        self._points = TextPool.of([_encode_points(line.points) for line in self._lines])
-        self._words = TextPool.of([text.text.encode() for text in self._texts])
+        points = np.array([point for line in self._lines for point in line.points], dtype=float).reshape(-1, 3)
+        first = start_offsets(_count([line.points for line in self._lines]))
+        self._points = MessagePool(first, dict(zip("xyz", points.T, strict=True)))
+        self._words = TextPool.of([text.text for text in self._texts])
 
     def content(self, moving: MovingEntities, rows: slice) -> Content:
         """The entities of some rows (P,)."""
@@ -405,17 +317,17 @@ class _EncodedLooks:
             "id": self._names.at(look),
             "metadata": self._says.at(look),
             "lines": RepeatedMessages(lines, {
-                "pose": _encode_pose(*(column[of_line] for column in columns)),
+                "pose": pose_content(*(column[of_line] for column in columns)),
                 "thickness": _column([[each.width] for each in self._lines])[line, 0], "scale_invariant": 1,
                 "points": self._points.at(line), "color": _encode_colours(self._lines, line),
             }),
             "texts": RepeatedMessages(texts, {
-                "pose": _encode_pose(x, y, z, np.zeros(len(x))), "billboard": 1,
+                "pose": pose_content(x, y, z, np.zeros(len(x))), "billboard": 1,
                 "font_size": _column([[each.size] for each in self._texts])[text, 0], "scale_invariant": 1,
                 "color": _encode_colours(self._texts, text), "text": self._words.at(text),
             }),
             "cylinders": RepeatedMessages(ellipses, {
-                "pose": _encode_pose(*(column[of_ellipse] for column in columns)),
+                "pose": pose_content(*(column[of_ellipse] for column in columns)),
                 "size": {axis: size[ellipse, k] for k, axis in enumerate("xyz")},
                 "bottom_scale": 1.0, "top_scale": 1.0, "color": _encode_colours(self._ellipses, ellipse),
             }),
@@ -443,40 +355,13 @@ def _encode_colours(elements: Sequence[Line | Text | Ellipse], which: Int) -> Co
     return {shade: colours[which, k] for k, shade in enumerate("rgba")}
 
 
-def _encode_pose(x_m: Float, y_m: Float, z_m: Float, yaw_rad: Float) -> Content:
-    return {"position": {"x": x_m, "y": y_m, "z": z_m}, "orientation": encode_orientation(yaw_rad)}
-
-
-def _encode_points(points: Sequence[Place]) -> bytes:
-    """The points of a line as encoded fields of a LinePrimitive."""
-    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-
-    line = LinePrimitive()
-    for x, y, z in points:
-        line.points.add(x=x, y=y, z=z)
-    encoded: bytes = line.SerializeToString(deterministic=True)
-    return encoded
-
-
-def load_transform_class() -> Any:
-    """The FrameTransform class, imported when first needed."""
-    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-
-    return FrameTransform
-
-
-def encode_transform(parent: str, pose: Pose, time_ns: int, child: str) -> bytes:
-    """The pose of the frame `child` in the frame `parent`: foxglove.FrameTransform."""
-    transform = load_transform_class()(parent_frame_id=parent, child_frame_id=child)
-    transform.timestamp.FromNanoseconds(time_ns)
-    transform.translation.x, transform.translation.y, transform.translation.z = pose.x_m, pose.y_m, pose.z_m
-    transform.rotation.z, transform.rotation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
-    encoded: bytes = transform.SerializeToString(deterministic=True)
-    return encoded
-
-
-def _place_primitive(primitive: Any, pose: Pose, colour: tuple[float, float, float, float]) -> None:
-    position, orientation, color = primitive.pose.position, primitive.pose.orientation, primitive.color
-    position.x, position.y, position.z = pose.x_m, pose.y_m, pose.z_m
-    orientation.z, orientation.w = math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
-    color.r, color.g, color.b, color.a = colour
+def transform_content(parent: str, child: str, poses: Sequence[Pose], time_ns: Int) -> Content:
+    """The poses of the frame `child` in the frame `parent`: content of foxglove.FrameTransform."""
+    placed = pose_content(*np.array(poses).reshape(-1, 4).T)
+    names = {"parent_frame_id": parent, "child_frame_id": child}
+    return {
+        "timestamp": Instants(time_ns),
+        **{key: repeat_text(name, len(poses)) for key, name in names.items()},
+        "translation": placed["position"],
+        "rotation": placed["orientation"],
+    }

@@ -1,198 +1,187 @@
-"""Copying a recording into replay.mcap, from any container: an MCAP file, a folder of them, an OSI trace.
+"""Copying a recording into replay.mcap, from any container: an MCAP file, a folder of them, an OSI trace, several.
 
-The files of a folder are merged: schemas, channels, records and attachments that several of them share are kept once.
-A trace becomes one channel. Of several recordings of a drive, topics are labelled and log times are by the first clock.
+Every channel, message, metadata record and attachment is copied as it was; a window restricts messages only. Those
+that several files share are kept once. A sound file is read in order of log time through its index; a damaged one from
+its start as far as it goes, and sorted.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from importlib.metadata import version
-from typing import Protocol, cast
+from pathlib import Path
 
-from mcap.records import Channel, Message
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Header, McapRecord, Message, Metadata
+from mcap.writer import Writer
 
-from copem_replay.io.channel import AHEAD, PART
-from copem_replay.io.containers.mcap_records import renumber_message
-from copem_replay.io.containers.osi_trace import TraceLog
-from copem_replay.io.containers.rosbag2 import BagLog, merge_streams
-from copem_replay.io.log import Log
-from copem_replay.io.open import (
-    JoinedLog,
-    JoinedRecording,
-    Local,
-    label_topic,
-    move_to_first_clock,
-    open_log,
-    recording_label,
+from copem_replay.io.channel import AHEAD, PART, Channel
+from copem_replay.io.containers.mcap_records import (
+    DAMAGE,
+    MAGIC,
+    RecordsFromStart,
+    drop_traceback,
+    parse_record,
+    read_record_at,
+    read_summary,
+    renumber_message,
 )
+from copem_replay.io.containers.osi_trace import TraceLog
+from copem_replay.io.containers.rosbag2 import BagLog
+from copem_replay.io.log import BrokenIndexError, Log, open_file
+from copem_replay.io.open import JoinedLog, Local, open_log
 from copem_replay.io.schemas.osi_ground_truth import load_message_class
 from copem_replay.io.window import Window
-from copem_replay.io.write.message_family import OSI_CHANNEL, Catalogue, OriginalMcap, osi_version
+from copem_replay.io.write.osi import OSI_VERSION
+
+OSI_CHANNEL = "net.asam.osi.trace.channel."
+"""Keys in the metadata of a channel of OSI begin so."""
 
 
-class RecordingSource(Protocol):
-    """A recording to be copied: its channels and metadata, and its messages on demand.
+class Catalogue:
+    """Schemas, channels and attachments of a file that is being written: equal ones are written once."""
 
-    `damage`: a note that not all of it can be copied, None: all can.
+    def __init__(self, writer: Writer) -> None:
+        self.writer = writer
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[object, ...], int] = {}
+        self._attached: set[tuple[object, ...]] = set()
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """The number of a schema, which is written if it is new."""
+        if (name, encoding, data) not in self._schemas:
+            self._schemas[name, encoding, data] = self.writer.register_schema(name, encoding, data)
+        return self._schemas[name, encoding, data]
+
+    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """The number of a channel, which is written if it is new."""
+        ordered = dict(sorted(metadata.items()))
+        key = (topic, encoding, schema, tuple(ordered.items()))
+        if key not in self._channels:
+            self._channels[key] = self.writer.register_channel(topic, encoding, schema, ordered)
+        return self._channels[key]
+
+    def attach(self, a: Attachment) -> None:
+        """Write an attachment if it is new."""
+        key = (a.create_time, a.log_time, a.name, a.media_type, a.data)
+        if key not in self._attached:
+            self._attached.add(key)
+            self.writer.add_attachment(*key)
+
+
+class RecordingSource:
+    """A recording to be copied: its channels, with the topics of their own files, and its metadata records.
+
+    `damage`: a note that not all of it can be copied, None: all can. Files with an index are read once for that.
     """
 
-    profile: str
-    metadata: dict[str, dict[str, str]]
-    channels: dict[int, Channel]
-    damage: str | None
+    def __init__(self, log: Log) -> None:
+        self._log, records = log.attempt(_read_through)
+        whole = self._log
+        damaged = whole is not log or not whole.complete
+        self.damage = "damaged: its messages are copied as far as they can be read" if damaged else None
+        recordings = [part.log for part in whole.parts] if isinstance(whole, JoinedLog) else [whole]
+        profiles = {_find_profile(records[next(_list_files(recording)).path]) for recording in recordings}
+        self.profile = profiles.pop() if len(profiles) == 1 else ""
+        self.metadata: dict[str, dict[str, str]] = {}
+        for record in (record for of_file in records.values() for record in of_file):
+            if isinstance(record, Metadata):  # merged with others of its name: rosbag2 writes one name several times
+                self.metadata.setdefault(record.name, {}).update(record.metadata)
+        self._attachments = [a for of_file in records.values() for a in of_file if isinstance(a, Attachment)]
+        self._topics = {channel.number: channel.topic for channel in whole.channels}
+        self.channels = dict(_list_channels(whole))
 
     def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
         """Put schemas, channels and attachments into the output, except the topics `without`.
 
         Returns the new number of each channel by its number here.
         """
+        numbers: dict[int, int] = {}
+        for number, c in self.channels.items():
+            if c.topic not in without:
+                named = c.schema or c.schema_encoding or c.schema_data
+                schema = catalogue.schema(c.schema, c.schema_encoding, c.schema_data) if named else 0
+                numbers[number] = catalogue.channel(self._topics[number], c.encoding, schema, dict(c.metadata))
+        for attachment in self._attachments:
+            catalogue.attach(attachment)
+        return numbers
 
     def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
         """The messages in order of log time, with the channel numbers of the output."""
+        return (renumber_message(message, numbers) for message in self._log.messages(numbers.keys(), sort=True))
 
 
 def open_source(path: Local, window: Window | None = None) -> RecordingSource:
     """The recording to be copied, or a window of it. Raises RecordingError: nothing can be read."""
-    return _make_source(open_log(path).within(window))
+    return RecordingSource(open_log(path).within(window))
 
 
-def _make_source(log: Log) -> RecordingSource:
+def _read_through(log: Log) -> tuple[Log, dict[Path, list[McapRecord]]]:
+    """The log, and the records of each file besides messages. Raises BrokenIndexError."""
+    records = {file.path: _read_records(file) for file in _list_files(log)}
+    if any(file.indexed for file in _list_files(log)):
+        for _message in log.messages({c.number for c in log.channels}):
+            pass
+    return log, records
+
+
+def _list_files(log: Log) -> Iterator[Log]:
+    """The log of each file of a recording, or of several."""
+    if isinstance(log, BagLog | JoinedLog):
+        for part in log.parts:
+            yield from _list_files(part.log)
+    else:
+        yield log
+
+
+def _read_records(log: Log) -> list[McapRecord]:
+    """The header, the metadata records and the attachments of a file. Raises BrokenIndexError."""
+    if isinstance(log, TraceLog):
+        return []
+    with open_file(log.path) as file:
+        if not log.indexed:
+            return [r for r in RecordsFromStart(file) if isinstance(r, Header | Metadata | Attachment)]
+        try:
+            if (summary := read_summary(file)) is None:
+                raise ValueError("the index is gone")
+            places = [
+                (len(MAGIC), Opcode.HEADER),
+                *((index.offset, Opcode.METADATA) for index in summary.metadata_indexes),
+                *((index.offset, Opcode.ATTACHMENT) for index in summary.attachment_indexes),
+            ]
+            records = [parse_record(opcode, read_record_at(file, offset, opcode)) for offset, opcode in places]
+        except DAMAGE as error:
+            raise BrokenIndexError(log.path) from drop_traceback(error)
+    return [record for record in records if record is not None]
+
+
+def _find_profile(records: list[McapRecord]) -> str:
+    return next((record.profile for record in records if isinstance(record, Header)), "")
+
+
+def _list_channels(log: Log) -> Iterator[tuple[int, Channel]]:
+    """Each channel by its number in the log: with the topic in its own file, and the metadata of the copy."""
     if isinstance(log, JoinedLog):
-        return _JoinedSource(log)
-    if isinstance(log, BagLog):
-        return _BagSource(log)
-    return _TraceSource(log) if isinstance(log, TraceLog) else OriginalMcap(log)
+        joint = {channel.number: channel for channel in log.channels}
+        for part in log.parts:
+            for theirs, c in _list_channels(part.log):
+                labelled = joint[part.numbers[theirs]]
+                labels = ({AHEAD: str(labelled.ahead_ns)} if labelled.ahead_ns else {}) | {PART: labelled.part}
+                yield labelled.number, replace(c, metadata={**c.metadata, **labels})
+        return
+    for c in log.channels:
+        yield c.number, _describe_trace(log, c) if isinstance(log, TraceLog) else c
 
 
-class _NumberedFiles:
-    """The channels and records of several files, with channels numbered consecutively."""
+def _describe_trace(log: TraceLog, channel: Channel) -> Channel:
+    """The channel of a trace, with the definition and the metadata that OSI has for channels."""
+    from mcap_protobuf.schema import build_file_descriptor_set
 
-    def __init__(self, files: Sequence[RecordingSource]) -> None:
-        self.metadata: dict[str, dict[str, str]] = {}
-        for file in files:
-            for name, record in file.metadata.items():
-                self.metadata.setdefault(name, {}).update(record)
-        every = [(k, number, c) for k, file in enumerate(files) for number, c in file.channels.items()]
-        self._place = {place: (k, number) for place, (k, number, _) in enumerate(every)}
-        self.channels = {place: channel for place, (_, _, channel) in enumerate(every)}
-        self._count = len(files)
-
-    def numbered_through(self, numbers: Sequence[dict[int, int]]) -> dict[int, int]:
-        """The output's number by this numbering, from the output's numbers by each file's own numbering."""
-        return {place: numbers[k][n] for place, (k, n) in self._place.items() if n in numbers[k]}
-
-    def by_file(self, numbers: Mapping[int, int]) -> list[dict[int, int]]:
-        """For each file the output's number by the file's own, from those by this numbering."""
-        result: list[dict[int, int]] = [{} for _ in range(self._count)]
-        for place, number in numbers.items():
-            k, number_in_file = self._place[place]
-            result[k][number_in_file] = number
-        return result
-
-
-class _BagSource:
-    def __init__(self, bag: BagLog) -> None:
-        self._files = [OriginalMcap(part.log) for part in bag.parts]
-        self._several = _NumberedFiles(self._files)
-        self.profile = self._files[0].profile
-        self.metadata, self.channels = self._several.metadata, self._several.channels
-        whole = not bag.lost and not any(file.damage for file in self._files)
-        self.damage = None if whole else "damaged: its messages are copied as far as they can be read"
-
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        return self._several.numbered_through([file.register(catalogue, without) for file in self._files])
-
-    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        each = zip(self._files, self._several.by_file(numbers), strict=True)
-        return merge_streams(
-            [
-                (file.start_ns, partial(file.messages, numbers_in_file))
-                for file, numbers_in_file in each
-                if numbers_in_file
-            ]
-        )
-
-
-class _LabelledCatalogue:
-    """A catalogue for one recording of several: it labels shared topics and adds clock and recording to channels."""
-
-    def __init__(self, catalogue: Catalogue, part: JoinedRecording, several: Collection[str]) -> None:
-        self._catalogue, self._part, self._several = catalogue, part, several
-        self.schema, self.attach = catalogue.schema, catalogue.attach
-
-    def channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        ahead_ns = self._part.ahead_ns + int(metadata.get(AHEAD, "0"))
-        labels = metadata | ({AHEAD: str(ahead_ns)} if ahead_ns else {})
-        labels |= {PART: recording_label(self._part.label, metadata.get(PART, ""))}
-        topic = label_topic(topic, self._part.label) if topic in self._several else topic
-        return self._catalogue.channel(topic, encoding, schema, labels)
-
-
-class _JoinedSource:
-    def __init__(self, log: JoinedLog) -> None:
-        self._parts = log.parts
-        self._files = [_make_source(part.log) for part in log.parts]
-        profiles = {file.profile for file in self._files}
-        self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self._all = _NumberedFiles(self._files)
-        self.metadata, self.channels = self._all.metadata, self._all.channels
-        counts = Counter(topic for file in self._files for topic in {c.topic for c in file.channels.values()})
-        self._shared = {topic for topic, count in counts.items() if count > 1}
-        self.damage = next((file.damage for file in self._files if file.damage), None)
-
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        numbers = [
-            file.register(cast("Catalogue", _LabelledCatalogue(catalogue, part, self._shared)), without)
-            for file, part in zip(self._files, self._parts, strict=True)
-        ]
-        return self._all.numbered_through(numbers)
-
-    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        each = zip(self._files, self._parts, self._all.by_file(numbers), strict=True)
-        return merge_streams(
-            [
-                (part.log.start_ns - part.ahead_ns, partial(_move_messages, file, numbers_in_file, part.ahead_ns))
-                for file, part, numbers_in_file in each
-                if numbers_in_file
-            ]
-        )
-
-
-def _move_messages(file: RecordingSource, numbers: Mapping[int, int], ahead_ns: int) -> Iterator[Message]:
-    return (move_to_first_clock(message, message.channel_id, ahead_ns) for message in file.messages(numbers))
-
-
-class _TraceSource:
-    profile = ""
-
-    def __init__(self, trace: TraceLog) -> None:
-        self._trace = trace
-        (self._channel,) = trace.channels
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.damage = None if trace.complete else "damaged: its messages are copied as far as they can be read"
-        about = {
-            f"{OSI_CHANNEL}description": f"the trace {trace.path.name}",
-            f"{OSI_CHANNEL}osi_version": trace.osi_version or osi_version(),
-            f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
-        }
-        number, topic = self._channel.number, self._channel.topic
-        self.channels = {number: Channel(number, topic, self._channel.encoding, about, number)}
-
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        from mcap_protobuf.schema import build_file_descriptor_set
-
-        definition = build_file_descriptor_set(load_message_class(self._channel.schema)).SerializeToString(
-            deterministic=True
-        )
-        schema = catalogue.schema(self._channel.schema, "protobuf", definition)
-        return {
-            number: catalogue.channel(channel.topic, channel.message_encoding, schema, channel.metadata)
-            for number, channel in self.channels.items()
-            if channel.topic not in without
-        }
-
-    def messages(self, numbers: Mapping[int, int]) -> Iterator[Message]:
-        return (renumber_message(message, numbers) for message in self._trace.messages(numbers.keys()))
+    about = {
+        f"{OSI_CHANNEL}description": f"the trace {log.path.name}",
+        f"{OSI_CHANNEL}osi_version": log.osi_version or OSI_VERSION,
+        f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
+    }
+    definition = build_file_descriptor_set(load_message_class(channel.schema)).SerializeToString(deterministic=True)
+    return replace(channel, schema_encoding="protobuf", schema_data=definition, metadata=about)
