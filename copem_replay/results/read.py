@@ -40,7 +40,7 @@ from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.limits import find_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
+from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, read_made, take_place
 from copem_replay.results.provenance import (
     Provenance,
     read_provenance,
@@ -183,6 +183,10 @@ class Results:
         rows = read_log_rows(self._files_at / name, self.provenance.kinds(name, compared=True), self._files(name))
         self.check_unchanged()
         return rows
+
+    def check_made(self, name: str, again: str) -> None:
+        """Raise InputError where what a command made of the results is not what it wrote. `again`: how to make it."""
+        check_sealed(self._files_at, name, read_made(self._files_at), again)
 
     def _check_sealed(self, name: str) -> None:
         """Raise InputError where a file is not what was written, or other results have taken its place."""
