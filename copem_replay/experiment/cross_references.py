@@ -322,14 +322,14 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
     known = [str(name) for name in _mapping(study, "configurations")]
     for name, criterion in _items(source.data, "criteria"):
         key: Key = ("criteria", name)
-        metric, against = criterion.get("metric"), criterion.get("against")
-        if isinstance(metric, str) and (problem := _find_metric_problem(metric, against is not None, study)):
+        metric, against = str(criterion.get("metric")), criterion.get("against")
+        problem = _find_metric_problem(metric, against is not None, study)
+        if isinstance(criterion.get("metric"), str) and problem is not None:
             yield source.at((*key, "metric"), problem)
-        if criterion.get("weigh") is not None and metric not in JUDGED and not (against and _is_of_rows(metric)):
-            message = (
-                f"expected `weigh` with a metric of detections, found {metric}, which is over pairs, lists or minutes"
-            )
-            yield source.at((*key, "weigh"), message)
+        of_rows = against and metric in COMPARED and COMPARED[metric].part != "lists"
+        if criterion.get("weigh") is not None and metric not in JUDGED and not of_rows:
+            what = f"{metric}, which is over pairs, lists or minutes"
+            yield source.at((*key, "weigh"), f"expected `weigh` with a metric of detections, found {what}")
         for at, one in find_values(criterion, "configurations", ITEMS, above=key):
             if isinstance(one, str | int) and str(one) not in known:
                 yield source.at(at, _unknown_configuration(one, known))
@@ -342,11 +342,6 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
             if where != BEFORE or (other and "@" not in str(against)):
                 hint = f"; of the results given by --before: {against}@{BEFORE}, or {BEFORE} for the same name"
                 yield source.at((*key, "against"), _unknown_configuration(against, known) + hint)
-
-
-def _is_of_rows(metric: object) -> bool:
-    """Whether a compared metric is of rows of detections."""
-    return metric in COMPARED and COMPARED[str(metric)].part != "lists"
 
 
 def _unknown_configuration(name: object, known: Sequence[str]) -> str:
@@ -393,7 +388,7 @@ def read_criteria(given: Path | Mapping[str, Any], study: Mapping[str, Any]) -> 
     try:
         criteria = CriteriaFile.model_validate(source.data).criteria
     except ValidationError as error:
-        shape = describe_by_key(CriteriaFile, error, source.data)
+        shape = describe_by_key(error, source.data)
         raise ExperimentError([*problems, *(source.at(key, message) for key, message in shape)]) from None
     if problems:
         raise ExperimentError(problems)

@@ -89,7 +89,7 @@ class TestReferences:
             "units": {"mast": {"pem": "camra"}},
             "configurations": {"A": {"units": "all", "latency_s": {"mats": 1}, "link": {"mats": "radio"}}},
             "show": {"configurations": ["B"]}, "sweep": {"configurations": ["B"]}, "measure": {},
-            "criteria": {"c": {"configurations": ["B"]}},
+            "criteria": {"c": {"configurations": ["B"], "weigh": "drives"}},
         }  # fmt: skip
         places = [
             "logs[0].units.mats", "units.mast.pem", "configurations.A.latency_s.mats", "configurations.A.link.mats",
