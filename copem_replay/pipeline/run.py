@@ -301,11 +301,6 @@ class StudyTables:
         if batch:
             yield self.frame(batch), batch
 
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The rows of `detections.parquet` of all logs."""
-        return self.frame(self.parts())
-
     def rows(self, log: str, run: int | None = None) -> pd.DataFrame:
         """The rows of `detections.parquet` of one log, or of one run of it."""
         if run is None:
@@ -324,11 +319,6 @@ class StudyTables:
             return frame
         # Columns that only some configurations have come last, in whatever order tables were added.
         return frame.reindex(columns=[*(name for name in frame if name not in WAY), *WAY])
-
-    @cached_property
-    def accuracy(self) -> dict[str, pa.Table]:
-        """The tables of accuracy by the names of their files; empty: it is not measured."""
-        return {} if self.bands is None else self.accuracy_of(self.parts(), self.table)
 
     def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> dict[str, pa.Table]:
         """The tables of accuracy of some parts, which have these rows."""

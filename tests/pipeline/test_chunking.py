@@ -33,7 +33,7 @@ from copem_replay.pipeline.receiver import Reach, Receivers
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, pedestrian, write_recording
-from tests.helpers.replays import transmitted
+from tests.helpers.replays import study_accuracy, study_rows, transmitted
 from tests.helpers.scenes import Thing, driving, experiment, standing
 from tests.io import test_recorded_units as test_recorded
 from tests.viewer.test_rrd import rows
@@ -70,16 +70,16 @@ def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: i
 
 def assert_same(whole: StudyTables, pieces: StudyTables) -> None:
     assert [replay.chunks for replay in whole.replays] == [(TimeChunk(),)] * len(whole.replays)
-    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    pd.testing.assert_frame_equal(study_rows(whole), study_rows(pieces), check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
     assert whole.notes == pieces.notes
     assert (whole.sweep is None) == (pieces.sweep is None)
     if whole.sweep is not None:
         pd.testing.assert_frame_equal(whole.sweep, pieces.sweep, check_exact=True)
-    assert whole.accuracy
-    assert pieces.accuracy
+    assert study_accuracy(whole)
+    assert study_accuracy(pieces)
     pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
-    assert_same_tables(whole.accuracy, pieces.accuracy)
+    assert_same_tables(study_accuracy(whole), study_accuracy(pieces))
 
 
 def assert_same_tables(whole: dict[str, pa.Table], pieces: dict[str, pa.Table]) -> None:
@@ -245,8 +245,8 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], 60)
     assert len(pieces.replays[0].chunks) > 5
-    assert whole.table["conflict_detection_s"].notna().any()
-    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    assert study_rows(whole)["conflict_detection_s"].notna().any()
+    pd.testing.assert_frame_equal(study_rows(whole), study_rows(pieces), check_exact=True)
     pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
     for replay in (whole.replays[0], pieces.replays[0]):
         worlds = list(Receivers(transmitted(replay, plan, complete=False)).worlds())
