@@ -162,10 +162,10 @@ class Gatherer:
             outcomes.clear()
             return_memory()
         for part in parts:
-            kept[part.configuration] = part
             if self._cache is not None:
                 recipe = write_recipe(block.missing, part.configuration, log.identity, block.runs)
-                self._cache.write(recipe, part)
+                part = self._cache.write(recipe, part)
+            kept[part.configuration] = part
         return [part for part in kept.values() if part is not None]
 
     def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
@@ -201,8 +201,9 @@ BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 class StudyTables:
     """What a study gives: the tables of its results, and what is said beside them.
 
-    Rows come in part by part, and are in a file without a name, by log, configuration and runs; `kept`: they are
-    needed again, not only counted. The other tables and the notes are made of all of them. None: not asked for.
+    Parts come in by log, configuration and runs, and are read again from the folder that they are kept in; without one
+    from a file without a name, which no killed process leaves behind. `kept`: they are needed again, not only counted.
+    The other tables and the notes are made of all of them. None: not asked for.
     """
 
     experiment: Experiment
@@ -240,11 +241,6 @@ class StudyTables:
         """What results say of each log beside its rows."""
         return tuple(log.facts(self.experiment) for log in self.logs)
 
-    @property
-    def replays(self) -> tuple[Replay, ...]:
-        """The logs that are prepared and in memory."""
-        return tuple(log.ready for log in self.logs if log.ready is not None)
-
     def find_log(self, name: str) -> StudyLog:
         """A log by its name."""
         return next(log for log in self.logs if log.name == name)
@@ -265,7 +261,7 @@ class StudyTables:
             self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
         if not self.kept:
             return
-        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(self._store(part))
+        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(part.again or self._store(part))
 
     def _store(self, part: PartTables) -> Callable[[], PartTables]:
         try:

@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -190,7 +190,8 @@ class PartTables:
 
     `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and in lists the steps of
     `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
-    null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
+    null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy. `again`:
+    reads the part again where it is kept in a folder; None: it is not.
     """
 
     log: str
@@ -199,6 +200,7 @@ class PartTables:
     beside: pa.Table | None = None
     runs: pa.Table | None = None
     total: AccuracyTotal | None = None
+    again: Callable[[], PartTables] | None = field(default=None, compare=False, repr=False)
 
     @property
     def size_bytes(self) -> int:

@@ -99,7 +99,7 @@ class TestOneFromOutside:
         monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
         monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
         cut = outcome(plan)
-        assert len(cut.replays[0].chunks) > 2
+        assert len(cut.logs[0].replay().chunks) > 2
         assert study_rows(cut).equals(study_rows(whole))
         assert cut.summary.equals(whole.summary)
 

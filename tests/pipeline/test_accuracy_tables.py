@@ -231,7 +231,9 @@ class TestWhatIsThere:
             assert lists["run"].tolist() == list(range(8))
             instants = rows(result, name, "instants")
             assert instants["run"].tolist() == list(range(8))
-            late = instants["available_s"].map(lambda of: sum(t > 1e-6 + result.replays[0].scene.end_s for t in of))
+            late = instants["available_s"].map(
+                lambda of: sum(t > 1e-6 + result.logs[0].replay().scene.end_s for t in of)
+            )
             assert (instants["available_s"].map(len) - late).tolist() == lists["lists"].tolist()
             errors = rows(result, name)
             pd.testing.assert_frame_equal(

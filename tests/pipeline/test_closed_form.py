@@ -862,7 +862,7 @@ class TestPassing:
         """The mean verdict over 500 equally probable reactions, by the same judge as the runs."""
         result = replayed_file("tc016d", confirm=None)
         assert result.exact is not None
-        (ready,) = result.replays
+        (ready,) = (log.replay() for log in result.logs)
         (encounter,) = ready.encounters
         braking = ready.expanded.braking
         assert braking is not None
@@ -928,7 +928,7 @@ class TestPassing:
         Who may miss him fails with the mean of that over the instants at which he may be known, in 60 digits.
         """
         result = self.meeting(reaction, 0.9)
-        (between_s,) = result.replays[0].passing_s.values()
+        (between_s,) = result.logs[0].replay().passing_s.values()
         assert between_s[0, 1] == pytest.approx(3.1, abs=1e-4)
         rows = result.summary.set_index("configuration")
         with mp.workdps(60):

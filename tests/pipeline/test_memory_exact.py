@@ -267,7 +267,7 @@ def test_chunks_have_the_same_bits(of: str, path: str, rows: int) -> None:
         configurations={name: {"units": "all", "latency_s": {"mast": 0.3}, "fusion": f} for name, f in fusions.items()},
     )  # fmt: skip
     whole, pieces = both_ways(setup, [traffic()], rows)
-    assert len(pieces.replays[0].chunks) > 1
+    assert len(pieces.logs[0].replay().chunks) > 1
     assert_same(whole, pieces)
 
 

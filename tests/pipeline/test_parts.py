@@ -137,6 +137,29 @@ def test_a_log_that_is_shown_is_read_again_and_no_other(here: Path, monkeypatch:
     assert "replay/b.mcap" in again
 
 
+def test_parts_that_are_kept_are_nowhere_else(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results are written from them."""
+    plain, _, _ = replayed(study(runs=5), "plain", None)
+    monkeypatch.setattr(study_tables.tempfile, "TemporaryFile", None)
+    assert replayed(study(runs=5), "out")[0] == plain
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda part: part.write_bytes(part.read_bytes()[:-1])])
+def test_a_part_that_goes_while_results_are_written_is_a_line(here: Path, damage: Any) -> None:
+    Path("e.yaml").write_text(study(runs=5))
+    result = cr.run("e.yaml", jobs=2, pieces="kept")
+    part = sorted(Path("kept/parts").rglob("*.arrows"))[0]
+    damage(part)
+    with pytest.raises(InputError) as refused:
+        result.save("out")
+    assert str(refused.value) == (
+        f"--pieces: {part}: expected the part that was there before, found none, or a damaged one; "
+        "run the command again"
+    )
+    assert not Path("out").exists()
+    cr.run("e.yaml", jobs=2, pieces="kept").save("out")
+
+
 def test_what_is_damaged_is_computed_again(here: Path) -> None:
     text = study(runs=5)
     whole, _, _ = replayed(text, "whole")

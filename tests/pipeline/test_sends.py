@@ -205,7 +205,7 @@ def test_a_log_in_time_chunks_and_several_workers_give_the_same(monkeypatch: pyt
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
     cut = run_experiment(some, [car])
-    assert len(cut.replays[0].chunks) > 2
+    assert len(cut.logs[0].replay().chunks) > 2
     assert_same(whole, cut)
 
 
