@@ -291,8 +291,9 @@ def test_few_parts_are_in_memory_at_a_time(
         monkeypatch.setattr(study_tables, name, value)
     packed, read, most = [], [], [0]
     pack, unpack = study_tables.pack_part, study_tables.unpack_part
-    monkeypatch.setattr(study_tables, "pack_part", lambda *a: [packed.append(1), pack(*a)][1])
-    monkeypatch.setattr(study_tables, "unpack_part", lambda *a: [read.append(1), unpack(*a)][1])
+    for module in (study_tables, parts_module):  # where they wait in a file without a name, and where they are kept
+        monkeypatch.setattr(module, "pack_part", lambda *a: [packed.append(1), pack(*a)][1])
+        monkeypatch.setattr(module, "unpack_part", lambda *a: [read.append(1), unpack(*a)][1])
     frame = study_tables.StudyTables.frame
 
     def watched(self: Any, parts: Any) -> Any:
@@ -303,7 +304,7 @@ def test_few_parts_are_in_memory_at_a_time(
     monkeypatch.setattr(study_tables.StudyTables, "frame", watched)
     first, computed, _ = replayed(text, "first", kept)
     assert first == plain
-    assert len(packed) == len(read) > 4
+    assert 4 < len(read) <= len(packed)  # parts of swept points are kept, too, and not read again
     assert max(most) == 1
     if kept is not None:
         assert replayed(text, "again", kept) == (plain, 0, computed)
