@@ -154,14 +154,9 @@ def made_file(path: Path, *folders: Path, is_own: IsOwn = lambda path: False) ->
 
 @contextmanager
 def made_files(
-    folder: Path,
-    names: Sequence[str],
-    results: Path,
-    *,
-    is_own: IsOwn = lambda path: False,
-    way_out: str = "",
+    folder: Path, names: Sequence[str], results: Path, *, is_own: IsOwn = lambda path: False, way_out: str = "",
     sealed: bool = False,
-) -> Iterator[Path]:
+) -> Iterator[Path]:  # fmt: skip
     """A folder to write files in that are made of results: they replace those in `folder` together, as `atomic_files`
     does. `sealed`: other commands read them. Raises OutputError.
     """

@@ -260,11 +260,6 @@ class Results:
         return self.study, self.exporters
 
     @cached_property
-    def table(self) -> pd.DataFrame:
-        """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
-        return self.frame("detections.parquet")
-
-    @cached_property
     def rows(self) -> LogRows:
         """`detections.parquet`, log by log."""
         return self.log_rows("detections.parquet")
@@ -327,10 +322,10 @@ class Results:
         """`sweep.csv`; None: there is no such file."""
         return self._optional("sweep.csv")
 
-    @property
+    @cached_property
     def detections(self) -> pd.DataFrame:
-        """A row per log, configuration, run and measured object."""
-        return self.table
+        """A row per log, configuration, run and measured object; figures take `known` or `each`, which hold less."""
+        return self.frame("detections.parquet")
 
     @cached_property
     def accuracy(self) -> pd.DataFrame | None:

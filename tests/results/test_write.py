@@ -380,9 +380,9 @@ def test_a_table_of_many_rows_is_a_folder_that_reads_the_same(tmp_path: Path, mo
     names = ["a.parquet", "two%2Fb %25.parquet"]
     assert sorted(path.name for path in Path("many/detections.parquet").iterdir()) == names
     whole, many = cr.load_results("whole"), cr.load_results("many")
-    pd.testing.assert_frame_equal(whole.table, many.table)
+    pd.testing.assert_frame_equal(whole.detections, many.detections)
     in_any_order = pd.read_parquet("many/detections.parquet").sort_values(["log", "configuration", "run"])
-    assert len(in_any_order) == len(whole.table)
+    assert len(in_any_order) == len(whole.detections)
     first, second = (cr.compare(folder, baseline="PEM").table for folder in (whole, many))
     pd.testing.assert_frame_equal(first, second)
     listed = json.loads(Path("many/provenance.json").read_text())["files"]
