@@ -161,7 +161,7 @@ class TestClock:
             run_experiment(experiment(units={"mast": unit()}, **changes), [recording]),
         )
         [error_s] = np.unique(
-            clock_errors_s(clocks.replays[0].scene, ("mast",), off, np.zeros(1), np.zeros(1, dtype=int), 0)  # type: ignore[arg-type]
+            clock_errors_s(clocks.logs[0].replay().scene, ("mast",), off, np.zeros(1), np.zeros(1, dtype=int), 0)  # type: ignore[arg-type]
         )
         assert error_s > 0.005
         assert study_rows(exact)["position_rmse_captured_m"].item() < 1e-6

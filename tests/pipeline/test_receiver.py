@@ -137,7 +137,7 @@ class TestWhatDoesNotMatter:
         one = run_experiment(plan, logs)
         for jobs, size in ((3, 200_000_000), (1, 400 * 3 * 200), (2, 1)):
             monkeypatch.setattr(blocks_module, "BLOCK_BYTES", size)
-            assert len(blocks_module.cut_blocks(one.replays[0], plan, jobs)) > 1
+            assert len(blocks_module.cut_blocks(one.logs[0].replay(), plan, jobs)) > 1
             other = run_experiment(plan, logs, jobs=jobs)
             pd.testing.assert_frame_equal(study_rows(one), study_rows(other), check_exact=True)
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)
