@@ -92,18 +92,20 @@ def _check_names(data: Mapping[str, Any], names: Names) -> Problems:
     """Undefined names, and units that are named twice."""
     for path, what, before, after in _NAMED:
         known = [*before, *names[_SECTIONS[what]], *after]
+        right = {*known, TRUTH} if after == _BY_UNIT else {*known}
         for key, name in find_values(data, *path):
-            if _is_name(name) and str(name) not in known and not (after == _BY_UNIT and name == TRUTH):
+            if _is_name(name) and str(name) not in right:
                 yield key, unknown_name_message(what, name, known)
-    modelled = _list_modelled_units(data)
+    modelled, defined = {*_list_modelled_units(data)}, {*names["units"]}
     for of in ("units", "inputs"):
         for key, listed in find_values(data, "configurations", EACH, of):
-            members = _list_texts(listed) or []
-            for k, unit in enumerate(members):
+            left = {*defined}
+            for k, unit in enumerate(_list_texts(listed) or ()):
                 if of == "inputs" and unit in modelled:
                     yield (*key, k), f"unit {unit!r} has a PEM; the inputs of a stack are `recorded` units"
-                elif unit in names["units"] and unit in members[:k]:
+                elif unit in defined and unit not in left:
                     yield (*key, k), f"unit {unit!r} named twice"
+                left.discard(unit)
 
 
 def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
@@ -115,9 +117,8 @@ def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
             which = "modelled units; recorded ones are named" if names["units"] else "units"
             yield (*key, "units"), f"all: the experiment has no {which}"
         own = modelled if members == "all" else listed or []
-        memories = [one for unit in own for one in _list_memories(data, str(find_value(data, "units", unit, "pem")))]
-        placed = any(find_value(data, "units", unit, "placed") is not None for unit in own)
-        if find_value(configuration, "fusion", "combine") == "posterior" and (memories or placed):
+        lasting = (one for one in own if _has_memory(data, _mapping(data, "units", one)))
+        if find_value(configuration, "fusion", "combine") == "posterior" and any(lasting):
             yield (*key, "fusion", "combine"), "posterior draws anew at each instant and has no memory; use samples"
         if (kind := _fusion_kind(configuration)) is not None and members == TRUTH:
             yield (*key, "fusion"), f"the truth is not fused; {kind} needs units"
@@ -273,6 +274,11 @@ def _fusion_kind(configuration: Mapping[str, Any]) -> str | None:
     """The kind of a fusion by name; None: it is the ideal one."""
     kind = find_value(configuration, "fusion", "kind")
     return kind if isinstance(kind, str) and kind != "ideal" else None
+
+
+def _has_memory(data: Mapping[str, Any], unit: Mapping[str, Any]) -> bool:
+    """Whether any random draw of a unit lasts, in its PEM or in its own pose."""
+    return unit.get("placed") is not None or bool(_list_memories(data, str(unit.get("pem"))))
 
 
 def _list_memories(data: Mapping[str, Any], pem: str) -> list[Any]:
