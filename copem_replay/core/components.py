@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -26,11 +26,14 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    ModelWrapValidatorHandler,
     Tag,
     ValidationError,
     ValidationInfo,
     WithJsonSchema,
+    model_validator,
 )
+from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError, core_schema
 
 from copem_replay.core.errors import (
@@ -56,10 +59,38 @@ def drop_python_examples(schema: dict[str, Any]) -> None:
         schema["description"] = schema["description"].partition("\n\n>>> ")[0]
 
 
+UNKNOWN_KEY = "unknown_key"
+"""The type of the error for a key that a model does not know; `known` in its context: the names of those it knows."""
+
+
 class Frozen(BaseModel):
     """Base of all models: immutable, and a key that is not known is refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=drop_python_examples)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _list_known_keys(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """The model; the error for an unknown key has those that are known."""
+        try:
+            return handler(data)
+        except ValidationError as error:
+            items: list[Any] = error.errors(include_url=False)
+            own = [item for item in items if item["type"] == "extra_forbidden" and len(item["loc"]) == 1]
+            if not own:
+                raise
+            fields = {name: of for name, of in cls.model_fields.items() if SkipJsonSchema not in map(type, of.metadata)}
+            known = {"known": sorted(of.alias or name for name, of in fields.items())}
+            for item in own:
+                item |= {"type": UNKNOWN_KEY, "ctx": known}
+            for item in items:
+                if item["type"] not in _TYPES:
+                    context = {"message": item["msg"], **item.get("ctx", {})}
+                    item["type"] = PydanticCustomError(item["type"], "{message}", context)
+            raise ValidationError.from_exception_data(error.title, items) from None
+
+
+_TYPES = frozenset(get_args(core_schema.ErrorType))
 
 
 _FORM = Discriminator(lambda value: "mapping" if isinstance(value, dict | BaseModel) else "plain")

@@ -8,12 +8,12 @@ import os
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
+from copem_replay.core.components import UNKNOWN_KEY
 from copem_replay.core.errors import (
     ExperimentError,
     InputError,
@@ -30,31 +30,27 @@ from copem_replay.io.open import DriveRecordings, File, Place, first_recording, 
 # Problems of shape in the words of the file: the key, what was expected, what was found.
 
 
-def describe_by_key(
-    model: type[BaseModel], error: ValidationError, data: dict[str, Any], above: Key = ()
-) -> Iterator[tuple[Key, str]]:
-    """A message per key, which joins the alternatives of the key; those of a `kind` that is not meant are left out.
+def describe_by_key(error: ValidationError, data: dict[str, Any], above: Key = ()) -> Iterator[tuple[Key, str]]:
+    """A message per key, which joins the alternatives of the key.
 
-    `data`: the validated value, which stands at the key `above` of the data that `model` describes.
+    `data`: the validated value, which stands at the key `above`.
     """
     items_by_key: dict[Key, list[Any]] = {}
     for item in error.errors(include_url=False):
         if item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]:
             continue  # long enough, but its items were refused, which have their own lines
         items_by_key.setdefault((*above, *_file_key(data, item)), []).append(item)
-    for part in reversed(above):
-        data = {str(part): data}
     above_others = {key[:n] for key in items_by_key for n in range(len(key))}
     misspelt = {
-        (*key[:-1], *find_meant_key(key, _list_known_keys(model, key[:-1], data)))
+        (*key[:-1], *find_meant_key(key, items[0]["ctx"]["known"]))
         for key, items in items_by_key.items()
-        if items[0]["type"] == "extra_forbidden"
+        if items[0]["type"] == UNKNOWN_KEY
     }
     for key, items in items_by_key.items():
         # Another alternative fits so far, and its message names the deeper key; or the key is told of as it is written.
         if key in above_others or (key in misspelt and items[0]["type"] == "missing"):
             continue
-        yield key, _problem_message(model, items, key, data)
+        yield key, _problem_message(items, key)
 
 
 def _file_key(data: Any, item: Any) -> Key:
@@ -105,10 +101,10 @@ def find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
     return difflib.get_close_matches(str(key[-1]), known, n=1)
 
 
-def _problem_message(model: type[BaseModel], items: Sequence[Any], key: Key, data: Any) -> str:
+def _problem_message(items: Sequence[Any], key: Key) -> str:
     first = items[0]
-    if first["type"] == "extra_forbidden":
-        known = _list_known_keys(model, key[:-1], data)
+    if first["type"] == UNKNOWN_KEY:
+        known = first["ctx"]["known"]
         near = find_meant_key(key, known)
         hint = (
             f"did you mean {near[0]}?{_unit_hint(str(key[-1]), near[0])}" if near else f"known here: {', '.join(known)}"
@@ -177,43 +173,6 @@ def _percent_hint(item: Any) -> str:
     if not is_share or not 2 < item["input"] <= 100:  # 1.5 or 2 is hardly a percentage
         return ""
     return f"; a fraction: {item['input']:g} % is {item['input'] / 100:g}"
-
-
-@cache
-def _json_schema(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON Schema of a model, which takes a tenth of a second to make."""
-    return model.model_json_schema()
-
-
-def _list_known_keys(model: type[BaseModel], key: Key, data: Any) -> list[str]:
-    """Names of the keys that are allowed at a place of the file, sorted."""
-    schema = _json_schema(model)
-
-    def alternatives(part: Any) -> Iterator[dict[str, Any]]:
-        if isinstance(part, dict):
-            if "$ref" in part:
-                part = schema["$defs"][part["$ref"].rpartition("/")[2]]
-            yield part
-            for inner in (*part.get("anyOf", ()), *part.get("oneOf", ())):
-                yield from alternatives(inner)
-
-    places = [*alternatives(schema)]
-    for step in key:
-        data = data[step]
-        if isinstance(step, int):
-            inner = [p.get("items") or (p.get("prefixItems") or [{}])[0] for p in places]
-        else:
-            inner = [p.get("properties", {}).get(step) or p.get("additionalProperties") for p in places]
-        places = [found for part in inner for found in alternatives(part)]
-    names = [place["properties"] for place in places if "properties" in place]
-    meant = [place for place in names if _is_meant(place.get("kind", {}), data.get("kind"))]
-    return sorted({name for place in meant or names for name in place})
-
-
-def _is_meant(kinds: Mapping[str, Any], kind: object) -> bool:
-    """Whether an alternative has the `kind:` of the file, or is the default where the file has none."""
-    known = [kinds["const"]] if "const" in kinds else kinds.get("enum", [])
-    return kind in known or (kind is None and "default" in kinds)
 
 
 def _shorten_value(value: object) -> str:
@@ -362,7 +321,7 @@ def _logs_missing(source: ExperimentSource) -> list[str]:
 
 
 def _list_problems(source: ExperimentSource, error: ValidationError) -> Iterator[str]:
-    for key, message in describe_by_key(Experiment, error, source.data):
+    for key, message in describe_by_key(error, source.data):
         yield source.at(key, message)
 
 

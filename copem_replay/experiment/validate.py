@@ -194,7 +194,7 @@ def _unfit_settings(source: ExperimentSource, experiment: Experiment) -> Iterato
             try:
                 apply_settings(experiment, entry)
             except SettingsError as error:
-                for key, message in describe_by_key(Experiment, error.error, error.data, error.key):
+                for key, message in describe_by_key(error.error, error.data, error.key):
                     yield source.at(("logs", k, *key), message)
 
 

@@ -13,7 +13,8 @@ from enum import Enum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from copem_replay.core.components import (
     Component,
@@ -21,7 +22,6 @@ from copem_replay.core.components import (
     Positive,
     Share,
     ask_component,
-    drop_python_examples,
     wrong_answer_error,
 )
 from copem_replay.core.errors import ExperimentError, count_noun
@@ -134,6 +134,9 @@ class OnsetView:
         return speed
 
 
+AgainAfter = Annotated[Positive | None, Field(exclude_if=lambda value: value is None)]
+
+
 class Onset(Component, ABC):
     """Base of onsets. The onset of an object is the first frame, with the ego in the log, at which `holds`.
 
@@ -146,7 +149,7 @@ class Onset(Component, ABC):
     'Fast'
     """
 
-    again_after_s: Annotated[Positive | None, Field(exclude_if=lambda value: value is None)] = None
+    again_after_s: AgainAfter = None
     requires: ClassVar[Requires] = Requires.NOTHING
     """What the experiment needs for this onset; `check` says where it lacks. A property of the class, no field."""
 
@@ -285,19 +288,12 @@ class LineOfSight(_InSight):
     seen_by: ClassVar[Literal["ego", "any"]] = "ego"
 
 
-def _drop_again(schema: dict[str, Any]) -> None:
-    """Leave out the key that the onset `at` refuses."""
-    drop_python_examples(schema)
-    schema["properties"].pop("again_after_s", None)
-
-
 class At(Onset):
     """An instant of the log, the same for all objects that are then in it."""
 
-    model_config = ConfigDict(json_schema_extra=_drop_again)
-
     kind: Literal["at"] = "at"
     time_s: NotNegative
+    again_after_s: SkipJsonSchema[AgainAfter] = None  # refused
 
     @model_validator(mode="after")
     def _once(self) -> Self:

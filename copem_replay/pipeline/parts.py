@@ -17,6 +17,7 @@ import json
 import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -310,16 +311,30 @@ class PartCache:
         name = part_name(recipe)
         try:
             content = self.store.read(name)
-            return None if content is None else unpack_part(_unseal(content), log, configuration, recipe)
+            part = None if content is None else unpack_part(_unseal(content), log, configuration, recipe)
+            return part and self._reread(recipe, part)
         except (OSError, ValueError, KeyError, TypeError, IndexError) as error:  # what Arrow raises derives from these
             why = " ".join(str(error).split())[:120]
             self.damaged.append(f"{self.store.where}/{name}: damaged, computed again ({why})")
             return None
 
-    def write(self, recipe: str, part: PartTables) -> None:
-        """Keep a part. Raises OutputError."""
+    def write(self, recipe: str, part: PartTables) -> PartTables:
+        """Keep a part; returns it. Raises OutputError."""
         self.store.write(part_name(recipe), _seal(pack_part(part, recipe)))
         self.computed += 1
+        return self._reread(recipe, part)
+
+    def _reread(self, recipe: str, part: PartTables) -> PartTables:
+        """The part with how it is read again; as it is under a URL, where that would ask for it twice."""
+        log, configuration = part.log, part.configuration  # not the part itself, which would stay in memory
+
+        def again() -> PartTables:
+            if (found := self.read(recipe, log, configuration)) is None:
+                what = "expected the part that was there before, found none, or a damaged one; run the command again"
+                raise InputError(f"{_OPTION}{self.store.where}/{part_name(recipe)}: {what}")
+            return found
+
+        return replace(part, again=again) if isinstance(self.store, FolderStore) else part
 
     def known(self, about: str) -> dict[str, Any] | None:
         """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""

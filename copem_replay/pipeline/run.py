@@ -163,10 +163,10 @@ class Gatherer:
             outcomes.clear()
             return_memory()
         for part in parts:
-            kept[part.configuration] = part
             if self._cache is not None:
                 recipe = write_recipe(block.missing, part.configuration, log.identity, block.runs)
-                self._cache.write(recipe, part)
+                part = self._cache.write(recipe, part)
+            kept[part.configuration] = part
         return [part for part in kept.values() if part is not None]
 
     def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
@@ -202,8 +202,9 @@ BATCH_ROWS, BATCH_BYTES = 100_000, 16_000_000
 class StudyTables:
     """What a study gives: the tables of its results, and what is said beside them.
 
-    Rows come in part by part, and are in a file without a name, by log, configuration and runs; `kept`: they are
-    needed again, not only counted. The other tables and the notes are made of all of them. None: not asked for.
+    Parts come in by log, configuration and runs, and are read again from the folder that they are kept in; without one
+    from a file without a name, which no killed process leaves behind. `kept`: they are needed again, not only counted.
+    The other tables and the notes are made of all of them. None: not asked for.
     """
 
     experiment: Experiment
@@ -243,11 +244,6 @@ class StudyTables:
         """What results say of each log beside its rows."""
         return tuple(log.facts(self.experiment) for log in self.logs)
 
-    @property
-    def replays(self) -> tuple[Replay, ...]:
-        """The logs that are prepared and in memory."""
-        return tuple(log.ready for log in self.logs if log.ready is not None)
-
     def find_log(self, name: str) -> StudyLog:
         """A log by its name."""
         return next(log for log in self.logs if log.name == name)
@@ -268,7 +264,7 @@ class StudyTables:
             self._schema = pa.unify_schemas([self._schema, part.rows.schema], promote_options="permissive")
         if not self.kept:
             return
-        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(self._store(part))
+        self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(part.again or self._store(part))
 
     def _store(self, part: PartTables) -> Callable[[], PartTables]:
         try:
@@ -304,11 +300,6 @@ class StudyTables:
         if batch:
             yield self.frame(batch), batch
 
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """The rows of `detections.parquet` of all logs."""
-        return self.frame(self.parts())
-
     def rows(self, log: str, run: int | None = None) -> pd.DataFrame:
         """The rows of `detections.parquet` of one log, or of one run of it."""
         if run is None:
@@ -335,11 +326,6 @@ class StudyTables:
             return frame
         # Columns that only some configurations have come last, in whatever order tables were added.
         return frame.reindex(columns=[*(name for name in frame if name not in WAY), *WAY])
-
-    @cached_property
-    def accuracy(self) -> dict[str, pa.Table]:
-        """The tables of accuracy by the names of their files; empty: it is not measured."""
-        return {} if self.bands is None else self.accuracy_of(self.parts(), self.table)
 
     def accuracy_of(self, parts: Iterable[PartTables], rows: pd.DataFrame) -> dict[str, pa.Table]:
         """The tables of accuracy of some parts, which have these rows."""

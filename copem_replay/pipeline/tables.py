@@ -13,8 +13,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -198,7 +198,8 @@ class PartTables:
     `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and in lists the steps of
     `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
     null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
-    `needless`: rows of `needless.parquet`; None: not asked for.
+    `needless`: rows of `needless.parquet`; None: not asked for. `again`: reads the part again where it is kept in a
+    folder; None: it is not.
     """
 
     log: str
@@ -208,6 +209,7 @@ class PartTables:
     runs: pa.Table | None = None
     total: AccuracyTotal | None = None
     needless: pa.Table | None = None
+    again: Callable[[], PartTables] | None = field(default=None, compare=False, repr=False)
 
     @property
     def size_bytes(self) -> int:

@@ -12,7 +12,7 @@ import os
 import platform
 import stat
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,7 +42,7 @@ from copem_replay.core.files import (
 
 MARK = "provenance.json"
 MADE = "made.jsonl"
-"""Lists the files that commands made of the results later, a JSON string a line.
+"""Lists the files that commands made of the results later, a JSON string a line; sealed ones as {name: SHA-256}.
 
 Lines are only appended, so that two commands at a time lose none, and a half-written line is no name.
 """
@@ -80,32 +80,35 @@ def list_belongings(folder: Path) -> FolderFiles | None:
         return None
     listed = provenance.get("files")
     results = frozenset(map(str, listed)) if isinstance(listed, list) else None
-    return FolderFiles(results, read_made_names(folder))
+    return FolderFiles(results, frozenset(read_made(folder)))
 
 
-def read_made_names(folder: Path) -> frozenset[str]:
-    """The names listed as made of the results of a folder, and that of the list itself."""
-    names = {MADE}
+def read_made(folder: Path) -> dict[str, str | None]:
+    """Seals by the names listed as made of the results of a folder, the list itself included; None: not sealed."""
+    made: dict[str, str | None] = {MADE: None}
     for line in _read_made_list(folder).splitlines():
         with suppress(ValueError):
-            names.add(str(parse_json(line)))
-    return frozenset(names)
+            entry = parse_json(line)
+            made |= {name: str(seal) for name, seal in entry.items()} if isinstance(entry, dict) else {str(entry): None}
+    return made
 
 
-def add_to_made_list(folder: Path, files: Iterable[Path]) -> None:
+def add_to_made_list(folder: Path, files: Iterable[Path], seals: Mapping[str, str] | None = None) -> None:
     """List those of `files` that lie in a results folder as made of its results, with which they go.
 
-    To be called before a file gets its name, so that a killed process leaves no unlisted file. Raises OutputError.
+    `seals`: by file name, of those that other commands read. To be called before a file gets its name, so that a killed
+    process leaves no unlisted file. Raises OutputError.
     """
     root = os.path.realpath(folder)
     if not os.path.isfile(os.path.join(root, MARK)):
         return
     places = [os.path.join(os.path.realpath(file.parent), file.name) for file in files]
-    names = {os.path.relpath(place, root) for place in places if place.startswith(f"{root}{os.sep}")}
-    if not (new := sorted(names - read_made_names(folder))):
+    names = sorted(os.path.relpath(place, root) for place in places if place.startswith(f"{root}{os.sep}"))
+    made, listed = [(name, (seals or {}).get(Path(name).name)) for name in names], read_made(folder).items()
+    if not (new := [name if seal is None else {name: seal} for name, seal in made if (name, seal) not in listed]):
         return
     cut_off = _read_made_list(folder)[-1:] not in (b"", b"\n")  # the last line, by a killed process
-    text = "\n" * cut_off + "".join(f"{json.dumps(name)}\n" for name in new)
+    text = "\n" * cut_off + "".join(f"{json.dumps(entry)}\n" for entry in new)
     try:
         fd = os.open(folder / MADE, os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK, 0o666)
         with open(fd, "ab") as file:

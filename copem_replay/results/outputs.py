@@ -17,6 +17,7 @@ from copem_replay.core.errors import OutputError
 from copem_replay.core.extras import has_extra, load_extra
 from copem_replay.core.files import atomic_file, atomic_files, check_parent, remove_leftovers
 from copem_replay.results.folder import MADE, MARK, add_to_made_list, list_belongings
+from copem_replay.results.seals import digest_file
 
 IsOwn = Callable[[Path], bool]
 """Whether an existing recording or map is an earlier output of the same command, which it may replace."""
@@ -153,14 +154,17 @@ def made_file(path: Path, *folders: Path, is_own: IsOwn = lambda path: False) ->
 
 @contextmanager
 def made_files(
-    folder: Path, names: Sequence[str], results: Path, *, is_own: IsOwn = lambda path: False, way_out: str = ""
-) -> Iterator[Path]:
+    folder: Path, names: Sequence[str], results: Path, *, is_own: IsOwn = lambda path: False, way_out: str = "",
+    sealed: bool = False,
+) -> Iterator[Path]:  # fmt: skip
     """A folder to write files in that are made of results: they replace those in `folder` together, as `atomic_files`
-    does. Raises OutputError.
+    does. `sealed`: other commands read them. Raises OutputError.
     """
     check_output_folder(folder)
     for name in names:
         check_output(folder / name, is_own)
     with atomic_files(folder, names, way_out=way_out) as scratch:
         yield scratch
-        add_to_made_list(results, [folder / name for name in names if (scratch / name).exists()])
+        made = [name for name in names if (scratch / name).exists()]
+        seals = {name: digest_file(scratch / name) for name in made if sealed}
+        add_to_made_list(results, [folder / name for name in made], seals)

@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from copem_replay.core.components import MOST_RUNS
+from copem_replay.core.components import MOST_RUNS, UNKNOWN_KEY
 from copem_replay.core.errors import InputError, RecordingError, RemoteFile
 from copem_replay.core.files import parse_json
 from copem_replay.experiment.file import relocate_settings
@@ -155,7 +155,7 @@ def _check_measure(measure: dict[str, Any]) -> None:
         Measure.model_validate(measure)
     except ValidationError as error:
         for wrong in error.errors(include_url=False, include_context=False):
-            if wrong["type"] != "extra_forbidden":
+            if wrong["type"] != UNKNOWN_KEY:
                 raise ValueError(f"measure.{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}") from None
 
 

@@ -40,7 +40,7 @@ from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.limits import find_clusters
 from copem_replay.metrics.onset import COUNTS_BY, select_counted
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, take_place
+from copem_replay.results.folder import EXPERIMENT, MARK, check_inputs, check_unchanged, read_made, take_place
 from copem_replay.results.provenance import (
     Provenance,
     read_provenance,
@@ -184,6 +184,10 @@ class Results:
         self.check_unchanged()
         return rows
 
+    def check_made(self, name: str, again: str) -> None:
+        """Raise InputError where what a command made of the results is not what it wrote. `again`: how to make it."""
+        check_sealed(self._files_at, name, read_made(self._files_at), again)
+
     def _check_sealed(self, name: str) -> None:
         """Raise InputError where a file is not what was written, or other results have taken its place."""
         try:
@@ -256,11 +260,6 @@ class Results:
         return self.study, self.exporters
 
     @cached_property
-    def table(self) -> pd.DataFrame:
-        """`detections.parquet` as a whole, for users; figures take `known` or `each`, which hold less in memory."""
-        return self.frame("detections.parquet")
-
-    @cached_property
     def rows(self) -> LogRows:
         """`detections.parquet`, log by log."""
         return self.log_rows("detections.parquet")
@@ -323,10 +322,10 @@ class Results:
         """`sweep.csv`; None: there is no such file."""
         return self._optional("sweep.csv")
 
-    @property
+    @cached_property
     def detections(self) -> pd.DataFrame:
-        """A row per log, configuration, run and measured object."""
-        return self.table
+        """A row per log, configuration, run and measured object; figures take `known` or `each`, which hold less."""
+        return self.frame("detections.parquet")
 
     @cached_property
     def accuracy(self) -> pd.DataFrame | None:

@@ -1,8 +1,9 @@
 """Seals: `provenance.json` has the SHA-256 of every file of the results, and one of itself; readers check them.
 
 A file is read from end to end once for that, which takes less time than to decode it. Not sealed are recordings for
-Rerun, whose bytes are others in each writing: no command reads a figure from them. A file that is gone is no damage
-here: who needs it says so. Results of older versions have no seals.
+Rerun, whose bytes are others in each writing: no command reads a figure from them. What commands made of the results
+for others to read has its seal in `made.jsonl`. A file that is gone is no damage here: who needs it says so. Results of
+older versions have no seals.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _UNSEALED = ".rrd"
 
 def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object]) -> dict[str, object]:
     """What `provenance.json` says, with the seals of the named files in a folder, and of itself. Raises OSError."""
-    seals = {name: _digest_file(folder / name) for name in names if name != MARK and not name.endswith(_UNSEALED)}
+    seals = {name: digest_file(folder / name) for name in names if name != MARK and not name.endswith(_UNSEALED)}
     sealed = {**said, SEALS: seals}
     return {**sealed, SEALS: seals | {MARK: _digest_said(sealed)}}
 
@@ -41,22 +42,26 @@ def read_seals(said: Mapping[str, Any]) -> dict[str, str]:
     return seals
 
 
-def check_sealed(folder: Path, name: str, seals: Mapping[str, str]) -> None:
-    """Raise InputError where a file of results, or one of a table that is a folder, is not what was written."""
-    named = [one for one in seals if one == name or one.startswith(f"{name}/")]
+def check_sealed(folder: Path, name: str, seals: Mapping[str, str | None], again: str = AGAIN) -> None:
+    """Raise InputError where a file of results, or one of a table that is a folder, is not what was written.
+
+    `again`: what writes it again.
+    """
+    named = {one: seal for one, seal in seals.items() if seal and (one == name or one.startswith(f"{name}/"))}
     if seals and not named and (folder / name).exists():
-        raise InputError(f"{folder / name}: expected no such file among these results, found one; give it another name")
-    for one in named:
+        out = f"give it another name, or {again}"
+        raise InputError(f"{folder / name}: expected no such file among these results, found one; {out}")
+    for one, seal in named.items():
         try:
-            found = _digest_file(folder / one)
+            found = digest_file(folder / one)
         except OSError as error:
             raise InputError(
-                f"{folder / one}: expected a file of the results, found {error.strerror}; {AGAIN}"
+                f"{folder / one}: expected a file of the results, found {error.strerror}; {again}"
             ) from None
-        if found != seals[one]:
+        if found != seal:
             raise InputError(
-                f"{folder / one}: expected the file that was written, SHA-256 {seals[one][:12]}…, "
-                f"found {found[:12]}…; put it back, or {AGAIN}"
+                f"{folder / one}: expected the file that was written, SHA-256 {seal[:12]}…, "
+                f"found {found[:12]}…; put it back, or {again}"
             )
 
 
@@ -67,7 +72,7 @@ def _digest_said(said: Mapping[str, object]) -> str:
 _DIGESTS: dict[tuple[int, ...], str] = {}
 
 
-def _digest_file(path: Path) -> str:
+def digest_file(path: Path) -> str:
     """The SHA-256 of a file, taken once in a process as long as the file stays the same. Raises OSError."""
     with path.open("rb") as file:
         seen = os.fstat(file.fileno())

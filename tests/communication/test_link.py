@@ -18,6 +18,7 @@ from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.sweep import describe_unswept, list_points
 from copem_replay.report import write_html_report
 from tests.helpers import scenes
+from tests.helpers.replays import study_rows
 from tests.helpers.report_pages import Page, changed, replayed
 from tests.helpers.scenes import experiment
 
@@ -76,7 +77,7 @@ class TestOneFromOutside:
 
     def test_it_is_in_detections_and_summary(self) -> None:
         result = outcome(self.PLAN)
-        [row] = result.table.to_dict("records")
+        [row] = study_rows(result).to_dict("records")
         assert (row["captured_s"], row["detection_s"]) == pytest.approx((4.0, 5.1))
         assert row["distance_at_detection_m"] == pytest.approx(49.0)
         [line] = result.summary.to_dict("records")
@@ -98,13 +99,13 @@ class TestOneFromOutside:
         monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
         monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 40)
         cut = outcome(plan)
-        assert len(cut.replays[0].chunks) > 2
-        assert cut.table.equals(whole.table)
+        assert len(cut.logs[0].replay().chunks) > 2
+        assert study_rows(cut).equals(study_rows(whole))
         assert cut.summary.equals(whole.summary)
 
     def test_lists_that_are_lost(self) -> None:
         lossy = linked({"kind": f"{HERE}:Lossy", "unit": "ego", "until_s": 4.55})
-        assert outcome(lossy).table["detection_s"].tolist() == pytest.approx([4.6])
+        assert study_rows(outcome(lossy))["detection_s"].tolist() == pytest.approx([4.6])
 
     def test_it_is_in_the_results_and_the_report(self, tmp_path: Path) -> None:
         late = ("  late: {units: [ego], latency_s: 0.5}", f"  late: {{units: [ego], link: {{kind: '{HERE}:Filling'}}}}")
@@ -129,7 +130,9 @@ class TestOneFromOutside:
     def test_a_sweep_of_latency_adds_to_it(self) -> None:
         plan = linked({"kind": f"{HERE}:Filling"}, sweep={"latency_s": [0, 1], "configurations": ["PEM"]})
         assert describe_unswept(plan) == []
-        [swept] = [outcome(point.experiment).table["detection_s"] for point in list_points(plan) if point.value == 1]
+        [swept] = [
+            study_rows(outcome(point.experiment))["detection_s"] for point in list_points(plan) if point.value == 1
+        ]
         assert swept.tolist() == pytest.approx([6.1])
 
 

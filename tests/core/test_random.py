@@ -21,6 +21,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import cut_blocks, replay_outcomes
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.tables import add_row_accuracy
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 normal_quantile = njit(normal_quantile)  # as kernels call it
@@ -150,7 +151,7 @@ def rows_of(table: Any, **wanted: Any) -> Any:
 
 def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
     log = busy_log()
-    whole = run_experiment(plan(), [log]).table
+    whole = study_rows(run_experiment(plan(), [log]))
     ready = prepare_log(log, plan())
     for cut in ([0], [5], [11], [3, 4, 5], [0, 7]):
         part = pd.concat([build_frame(add_row_accuracy(one)) for one in replay_outcomes(ready, plan(), np.array(cut))])
@@ -159,7 +160,7 @@ def test_a_run_alone_is_the_same_run_in_a_batch_and_in_any_block() -> None:
         assert part.sort_values(keys).reset_index(drop=True).equals(expected.sort_values(keys).reset_index(drop=True))
     for jobs in (1, 2, 5):
         assert (len(cut_blocks(ready, plan(), jobs)) > 1) == (jobs > 1)
-        assert run_experiment(plan(), [log], jobs=jobs).table.equals(whole)
+        assert study_rows(run_experiment(plan(), [log], jobs=jobs)).equals(whole)
 
 
 def test_a_runs_states_do_not_depend_on_how_many_runs_there_are() -> None:
@@ -171,18 +172,18 @@ def test_a_runs_states_do_not_depend_on_how_many_runs_there_are() -> None:
 
 def test_adding_a_unit_or_a_configuration_changes_no_other_draw() -> None:
     log = busy_log()
-    before = run_experiment(plan(), [log]).table
+    before = study_rows(run_experiment(plan(), [log]))
     units = {"new": {"on": "c1", "height_m": 1.5, "pem": "sure"}, **UNITS}
     configurations = {"first": {"units": ["new"]}, **CONFIGURATIONS, "last": {"units": "all"}}
-    after = run_experiment(plan(units=units, configurations=configurations), [log]).table
+    after = study_rows(run_experiment(plan(units=units, configurations=configurations), [log]))
     assert rows_of(after, configuration=["PEM", "both"]).equals(before)
 
 
 def test_adding_or_removing_an_object_changes_no_draw_of_the_others() -> None:
     """The probabilities are constant here, so nothing but the dice could make a difference."""
-    before = run_experiment(plan(), [busy_log()]).table
+    before = study_rows(run_experiment(plan(), [busy_log()]))
     for other in (busy_log(more=True), busy_log(without="p2")):
-        after = run_experiment(plan(), [other]).table
+        after = study_rows(run_experiment(plan(), [other]))
         shared = sorted(set(before["object_id"]) & set(after["object_id"]))
         assert rows_of(after, object_id=shared).equals(rows_of(before, object_id=shared))
 

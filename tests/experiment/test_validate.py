@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from copem_replay.experiment.file import log_paths
+from copem_replay.experiment.file import log_paths, make_plain_source
 from copem_replay.experiment.validate import check_across_logs, find_problems, log_names, read_logs
 from copem_replay.io.recording import Recording
 from tests.helpers.experiments import TEXT, changed, drive, source_of
@@ -73,6 +75,34 @@ class TestReferences:
             "18: show.configurations[0]: no configuration is named 'coPEN'; did you mean coPEM?",
             "18: show.configurations[2]: no configuration is named '5'; there are GT, PEM, coPEM",
         ]
+
+    @pytest.mark.parametrize("wrong", [[2], {"a": 1}, [[2]], None, 3.5, True, {}, []], ids=repr)
+    @pytest.mark.parametrize("key", [
+        "logs[0].file", "logs[0].measure.distance_to", "pems", "units.mast.on", "units.mast.sends",
+        "configurations.A.units", "configurations.A.fusion", "links", "measure.distance_to", "measure.onset",
+        "measure.confirm", "braking", "ego", "max_gap_s", "runs", "show.run", "sweep.loss", "criteria.c.metric",
+    ])  # fmt: skip
+    def test_a_value_of_any_shape_hides_no_undefined_name(self, key: str, wrong: object) -> None:
+        """Also where both stand in one unit, configuration or log."""
+        study: dict[str, Any] = {
+            "logs": [{"file": "a.mcap", "units": {"mats": {}}, "measure": {}}],
+            "units": {"mast": {"pem": "camra"}},
+            "configurations": {"A": {"units": "all", "latency_s": {"mats": 1}, "link": {"mats": "radio"}}},
+            "show": {"configurations": ["B"]}, "sweep": {"configurations": ["B"]}, "measure": {},
+            "criteria": {"c": {"configurations": ["B"], "weigh": "drives"}},
+        }  # fmt: skip
+        places = [
+            "logs[0].units.mats", "units.mast.pem", "configurations.A.latency_s.mats", "configurations.A.link.mats",
+            "show.configurations[0]", "sweep.configurations[0]", "criteria.c.configurations[0]",
+        ]  # fmt: skip
+        place: Any = study
+        *path, last = [int(part) if part.isdigit() else part for part in re.findall(r"\w+", key)]
+        for part in path:
+            place = place[part]
+        place[last] = wrong
+        _, found = find_problems(make_plain_source(study))
+        told = [line.split(": ")[1] for line in found if " is named " in line]
+        assert set(places) <= set(told)
 
     def test_a_recorded_unit_without_a_place(self, tmp_path: Path) -> None:
         """Distances cannot be measured from it, and `all` does not mean it."""

@@ -18,7 +18,7 @@ from copem_replay.experiment.file import log_paths, read_experiment_file
 from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.extras.layout.command import layout
 from copem_replay.extras.layout.layout import build_layout, quote_topic, split_panels
-from copem_replay.results.folder import read_made_names
+from copem_replay.results.folder import read_made
 from tests.helpers import experiments
 from tests.helpers.replays import save_run
 from tests.io.test_write_ros2 import EXPERIMENT, drive
@@ -52,7 +52,7 @@ def test_results_of_several_logs_have_a_layout_each(tmp_path: Path) -> None:
     written = {path.name: json.loads(path.read_text()) for path in (folder / "replay").glob("*.foxglove.json")}
     assert sorted(written) == ["again.foxglove.json", "drive.foxglove.json"]
     assert written["drive.foxglove.json"] == build_layout(folder / "replay/drive.mcap")
-    assert {"replay/again.foxglove.json", "replay/drive.foxglove.json"} <= read_made_names(folder)
+    assert {"replay/again.foxglove.json", "replay/drive.foxglove.json"} <= read_made(folder).keys()
     with pytest.raises(
         InputError, match=r"--out: expected one replay, found 2 of several logs; name one: .*again\.mcap"
     ):

@@ -139,7 +139,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
 class TestLatePaths:
     def test_unknown_is_over_all_runs_and_of_never_until_its_end(self, results: Results, tmp_path: Path) -> None:
         """Six runs, of which two never know it: (4 × 1 + 2 × 4.5) / 6."""
-        table = results.table.copy()
+        table = results.detections.copy()
         one = (table["configuration"] == "late") & (table["object_id"] == "2")
         for name in ("time_to_detection_s", "detection_s"):
             table.loc[one, name] = 1.0 if name == "time_to_detection_s" else 1.5

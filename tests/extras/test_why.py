@@ -13,9 +13,11 @@ import pytest
 import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core.errors import InputError
+from tests.helpers.compare_folders import flip, places
 from tests.helpers.experiments import changed, drive
 
 TEXT = changed("show: null")
+AGAIN = "run `copem-replay why` on the folder again"
 
 
 @pytest.fixture
@@ -126,19 +128,42 @@ def test_without_why_the_report_has_no_such_section(call) -> None:  # type: igno
     assert "Mean over all runs" not in page
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "line"),
-    [
-        ("why.csv", "", "results/why/why.csv: cannot be read"),
-        ("why.csv", "configuration,cause\nPEM,hidden\n", "results/why/why.csv: cannot be read"),
-        ("why.csv", "configuration,cause,added_s,error_s,gained_s\nPEM,hidden,much,0,0\n", "why.csv: cannot be read"),
-        ("late_episodes.csv", "configuration,log,object_id,onset_s\n", "expected a column words, found none"),
-    ],
-)  # fmt: skip
-def test_damaged_tables_are_refused(results: Path, name: str, text: str, line: str) -> None:
-    (results / "why" / name).write_text(text)
-    with pytest.raises(InputError, match=line):
+@pytest.mark.parametrize("name", ["why.csv", "units.csv", "triage.csv", "late_episodes.csv"])
+def test_a_flipped_bit_of_a_table_is_refused(results: Path, name: str) -> None:
+    file = results / "why" / name
+    content = file.read_bytes()
+    for bit in places(file, 5):
+        flip(file, bit)
+        with pytest.raises(InputError) as refused:
+            cr.write_report(results)
+        line = f"{file}: expected the file that was written, SHA-256 .*; put it back, or {AGAIN}"
+        assert re.fullmatch(line, str(refused.value))
+        file.write_bytes(content)
+    cr.write_report(results)
+
+
+def test_a_flipped_bit_of_the_list_of_seals_never_shows_other_tables(results: Path) -> None:
+    made = results / "made.jsonl"
+    right, content = cr.write_report(results).read_bytes(), made.read_bytes()
+    refused = 0
+    for bit in places(made, 25):
+        flip(made, bit)
+        try:
+            assert cr.write_report(results).read_bytes() == right
+        except InputError as error:
+            refused += str(error).startswith(f"{results}/why/")
+        made.write_bytes(content)
+    assert refused > 10
+
+
+def test_a_table_that_why_did_not_write_is_refused(results: Path) -> None:
+    (results / "why/sensitivity.csv").write_text("variation,configuration,run,unknown_s\n")
+    with pytest.raises(InputError) as refused:
         cr.write_report(results)
+    assert str(refused.value) == (
+        f"{results}/why/sensitivity.csv: expected no such file among these results, found one; give it another name, "
+        f"or {AGAIN}"
+    )
 
 
 def test_they_go_with_the_results(results: Path) -> None:

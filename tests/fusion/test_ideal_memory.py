@@ -17,6 +17,7 @@ from copem_replay.fusion.ideal import fuse_ideal
 from copem_replay.fusion.ideal_memory import remember_states
 from copem_replay.fusion.interface import ConstantVelocity, IdealFusion
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.metrics.test_by_truth_id import World, tracks, worlds
 
@@ -103,7 +104,7 @@ def test_it_knows_what_the_ideal_knows_and_is_nearer_to_the_truth() -> None:
     )  # fmt: skip
     things = [Thing("ego", "car", standing(0, 0)), Thing("other", "car", driving(40, 3, -4))]
     result = run_experiment(plan, [recording(things, until_s=8.0)])
-    ideal, memory = (result.table[result.table["configuration"] == name] for name in fusions)
+    ideal, memory = (study_rows(result)[study_rows(result)["configuration"] == name] for name in fusions)
     assert ideal["detection_s"].tolist() == memory["detection_s"].tolist()
     of = result.summary.set_index("configuration")
     assert of.loc["memory", "position_rmse_m"] < 1.0 < 1.5 < of.loc["ideal", "position_rmse_m"]

@@ -182,3 +182,16 @@ def unseal(folder: Path) -> Path:
     said.pop("sha256", None)
     file.write_text(json.dumps(said))
     return folder
+
+
+def flip(path: Path, bit: int) -> None:
+    """Flip one bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def places(path: Path, count: int) -> list[int]:
+    """Bits of a file from its first to its last, and the same number on every run."""
+    last = 8 * path.stat().st_size - 1
+    return sorted({round(last * k / (count - 1)) for k in range(count)})

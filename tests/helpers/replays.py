@@ -1,6 +1,6 @@
 """Single steps of a replay: what units list, what is sent and received, and what receivers issue, in some runs.
 
-The last step: what a study gave, saved.
+The last steps: the rows that a study gave, and what it gave, saved.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
 
 from copem_replay.api.run import list_exporters
 from copem_replay.core.tracks import Int, TimeChunk
@@ -17,7 +19,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline.expansion import RunGroup
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import ReceiverOutput, Receivers
-from copem_replay.pipeline.run import run_experiment
+from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.world import Transmission, WorldChunk
 from copem_replay.results.read import Results
 
@@ -38,6 +40,16 @@ def outputs_of(replay: Replay, plan: Experiment, runs: Sequence[int] | Int = (0,
     lists = transmitted(replay, plan, runs)
     receivers, world = Receivers(lists), lists.world(TimeChunk(), -np.inf)
     return {name: receivers.fuse(world, name) for name in plan.configurations}
+
+
+def study_rows(study: StudyTables) -> pd.DataFrame:
+    """The rows of `detections.parquet`."""
+    return study.frame(study.parts())
+
+
+def study_accuracy(study: StudyTables) -> dict[str, pa.Table]:
+    """The tables of accuracy by the names of their files; empty: it is not measured."""
+    return {} if study.bands is None else study.accuracy_of(study.parts(), study_rows(study))
 
 
 def save_run(

@@ -23,7 +23,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import ReceiverOutput
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.recordings import CAR, PEDESTRIAN, SHARED, VEHICLE, Obj, Topic, ns, write_recording
-from tests.helpers.replays import outputs_of
+from tests.helpers.replays import outputs_of, study_rows
 
 
 def car(x: float | None, y: float = 0.0, *, vx: float = 0.0, kinds: Any = ((VEHICLE, CAR, 1.0),),
@@ -105,7 +105,7 @@ def figure(result: StudyTables, name: str, configuration: str = "union") -> floa
 
 def row(result: StudyTables, configuration: str) -> pd.Series:
     """Of the other car."""
-    return result.table[result.table["object_id"] == "2"].set_index("configuration").loc[configuration]
+    return study_rows(result)[study_rows(result)["object_id"] == "2"].set_index("configuration").loc[configuration]
 
 
 def about(path: Path, **changes: Any) -> list[list[str | None]]:

@@ -42,6 +42,7 @@ from tests.helpers.recordings import (
     write_mcap,
     write_recording,
 )
+from tests.helpers.replays import study_rows
 from tests.helpers.ros2 import header, made, odometry, pose, topic, transform
 from tests.io.test_osi_trace import packed
 from tests.io.test_recorded_units import car, list_of
@@ -143,7 +144,7 @@ def replayed(path: Path, **changes: Any) -> tuple[Recording, pd.DataFrame]:
     wanted = plan(**changes)
     recordings, refused = read_logs(wanted, [path], None)
     assert not refused, refused
-    return recordings[0], run_experiment(wanted, recordings).table
+    return recordings[0], study_rows(run_experiment(wanted, recordings))
 
 
 def check_same(cut: tuple[Recording, pd.DataFrame], whole: tuple[Recording, pd.DataFrame]) -> None:

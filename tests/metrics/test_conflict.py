@@ -41,6 +41,7 @@ from tests.helpers import scenes
 from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 will_enter = njit(will_enter)  # as kernels call it
@@ -67,7 +68,7 @@ def plan(*, horizon_s: float = 3.0, margin_m: float = 0.5, measure: dict[str, An
 
 def rows(log: Recording, wanted: Experiment) -> pd.DataFrame:
     """The rows of `detections.parquet`, by configuration, run and object."""
-    return run_experiment(wanted, [log]).table.set_index(["configuration", "run", "object_id"]).sort_index()
+    return study_rows(run_experiment(wanted, [log])).set_index(["configuration", "run", "object_id"]).sort_index()
 
 
 def event(log: Recording, wanted: Experiment, configuration: str = "GT", thing: str = "walker") -> float:
@@ -1021,7 +1022,7 @@ class TestErrors:
                 runs=5,
                 measure={"onset": onset, "count_earlier": count_earlier},
             )
-            found = run_experiment(wanted, [log.log]).table
+            found = study_rows(run_experiment(wanted, [log.log]))
             known = found[found["conflict_detected"]]
             assert known["detected"].all()
             assert (known["conflict_detection_s"] >= known["detection_s"] - 1e-9).all()
@@ -1056,19 +1057,21 @@ class TestRuns:
             pd.testing.assert_frame_equal(apart, together, check_exact=True)
 
     def test_whatever_the_number_of_workers_and_of_runs(self) -> None:
-        one, two = (run_experiment(self.WANTED, [self.LOG], jobs=jobs).table for jobs in (1, 2))
+        one, two = (study_rows(run_experiment(self.WANTED, [self.LOG], jobs=jobs)) for jobs in (1, 2))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
-        fewer = run_experiment(self.WANTED.model_copy(update={"runs": 5}), [self.LOG]).table
+        fewer = study_rows(run_experiment(self.WANTED.model_copy(update={"runs": 5}), [self.LOG]))
         first = one[one["run"] < 5].reset_index(drop=True)
         pd.testing.assert_frame_equal(fewer, first, check_exact=True)
 
     @pytest.mark.parametrize("kept", [["GT"], ["PEM"], ["two"], ["drawn"], ["drawn", "PEM"], ["two", "drawn", "GT"]])
     def test_configurations_do_not_disturb_one_another(self, kept: list[str]) -> None:
-        everything = run_experiment(self.WANTED, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
+        everything = study_rows(run_experiment(self.WANTED, [self.LOG])).set_index(
+            ["configuration", "run", "object_id"]
+        )
         fewer = self.WANTED.model_copy(
             update={"configurations": {name: self.WANTED.configurations[name] for name in kept}}
         )
-        alone = run_experiment(fewer, [self.LOG]).table.set_index(["configuration", "run", "object_id"])
+        alone = study_rows(run_experiment(fewer, [self.LOG])).set_index(["configuration", "run", "object_id"])
         for name in kept:
             pd.testing.assert_frame_equal(alone.loc[[name]], everything.loc[[name]], check_exact=True)
 
@@ -1088,10 +1091,10 @@ class TestRuns:
             pems=ERRORS, units=TWO_UNITS, configurations=FOUR, runs=12,
             measure={"confirm": {"hits": 2, "of": 3}, "onset": {"kind": "at", "time_s": 0.25}},
         )  # fmt: skip
-        plain = run_experiment(without, [self.LOG]).table
+        plain = study_rows(run_experiment(without, [self.LOG]))
         assert not set(COLUMNS) & set(plain.columns)
         pd.testing.assert_frame_equal(
-            run_experiment(self.WANTED, [self.LOG]).table[plain.columns], plain, check_exact=True
+            study_rows(run_experiment(self.WANTED, [self.LOG]))[plain.columns], plain, check_exact=True
         )
 
     def test_summary(self) -> None:
@@ -1117,13 +1120,13 @@ class TestRuns:
             braking=BRAKING | {"brakes_for": "conflict"},
         )  # fmt: skip
         result = run_experiment(wanted, [self.LOG])
-        assert len(result.table) == 0
-        assert set(COLUMNS) <= set(result.table.columns)
+        assert len(study_rows(result)) == 0
+        assert set(COLUMNS) <= set(study_rows(result).columns)
         assert result.summary["n"].tolist() == [0, 0, 0, 0]
 
     def test_one_log_of_two_has_nobody(self) -> None:
         empty = recording([Thing("ego", "car", driving(0, 0, 10))], until_s=1.0, log="empty")
-        found = run_experiment(plan(pems=ERRORS, units=TWO_UNITS, configurations=FOUR), [empty, self.LOG]).table
+        found = study_rows(run_experiment(plan(pems=ERRORS, units=TWO_UNITS, configurations=FOUR), [empty, self.LOG]))
         assert len(found) == 4
         assert found["conflict_detected"].dtype == bool
         assert found["conflict_detection_s"].dtype == float

@@ -18,6 +18,7 @@ from copem_replay.perception.observation import observe_objects
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording
 
 EXPERIMENT = {
@@ -55,7 +56,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_in_sight_is_when_the_first_list_shows_it_whatever_is_made_of_it(log: Path) -> None:
     result = run_experiment(Experiment.model_validate(EXPERIMENT), [read_log(log, name="drive")])
-    rows = result.table.set_index("configuration")
+    rows = study_rows(result).set_index("configuration")
     found = {name: rows.loc[name, ["in_sight_s", "captured_s", "detection_s"]].tolist() for name in rows.index}
     assert np.isnan(found["GT"][0]), "the truth needs no sight"
     assert found["alone"] == pytest.approx([1.1, 1.1, 1.4]), "the latency does not change what is in sight"
@@ -67,7 +68,7 @@ def test_what_is_never_in_sight_is_null(log: Path) -> None:
     measure = EXPERIMENT["measure"] | {"onset": {"kind": "at", "time_s": 0.0}}  # type: ignore[operator]
     wall = [{"polygon_m": [[12.0, -9.0], [13.0, -9.0], [13.0, 9.0], [12.0, 9.0]], "height_m": 9.0, "ground_z_m": 0.0}]
     chosen = Experiment.model_validate(EXPERIMENT | {"measure": measure, "obstacles": wall})
-    rows = run_experiment(chosen, [read_log(log, name="drive")]).table.set_index("configuration")
+    rows = study_rows(run_experiment(chosen, [read_log(log, name="drive")])).set_index("configuration")
     assert np.isnan(rows.loc["alone", "in_sight_s"])
     assert rows.loc["both", "in_sight_s"] == 0.0
 

@@ -49,6 +49,7 @@ from copem_replay.pipeline.tables import build_parts
 from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import study_accuracy
 from tests.helpers.scenes import Thing, driving, recording, standing
 from tests.metrics.test_conflict import drives, heading_along
 from tests.oracles import needless as oracle
@@ -718,12 +719,12 @@ class TestStudies:
             measure={"onset": {"kind": "in_range", "range_m": 80}},
         )  # fmt: skip
         found = run_experiment(plan, [cr.read_recording(LOGS / f"{name}.mcap")])
-        lists = found.accuracy["lists.parquet"].to_pandas()
+        lists = study_accuracy(found)["lists.parquet"].to_pandas()
         assert len(lists) == 5
         assert (lists["driving_s"] > 5).all()
         assert (lists["needless_brakes"] == 0).all()
         assert (lists["needless_s"] == 0).all()
-        assert found.accuracy["needless.parquet"].num_rows == 0
+        assert study_accuracy(found)["needless.parquet"].num_rows == 0
         missed = lists.set_index("configuration")["must_brake_missed_s"]
         assert missed["GT"] <= missed["exact"] <= missed["late"]
 
@@ -741,10 +742,10 @@ class TestStudies:
         assert (summary["driving_h"] * 3600).tolist() == pytest.approx([8.0] * 3)
         assert (summary["needless_interval_over"] == "runs").all()
         assert summary["needless_brakes_per_h_high"]["clean"] == pytest.approx(3.689 / (12 * 8 / 3600), rel=1e-3)
-        events = found.accuracy["needless.parquet"].to_pandas()
+        events = study_accuracy(found)["needless.parquet"].to_pandas()
         assert set(events.loc[events["configuration"] == "ghosts", "cause"]) == {"ghost"}
         assert events.loc[events["cause"] == "ghost", "object_id"].isna().all()
-        lists = found.accuracy["lists.parquet"].to_pandas().set_index(["configuration", "run"])
+        lists = study_accuracy(found)["lists.parquet"].to_pandas().set_index(["configuration", "run"])
         counted = events.groupby(["configuration", "run"]).size().reindex(lists.index, fill_value=0)
         assert (counted == lists["needless_brakes"]).all()
         most = events.groupby(["configuration", "run"])["speed_lost_mps"].max().reindex(lists.index, fill_value=0.0)
@@ -753,7 +754,7 @@ class TestStudies:
     def test_thresholds_of_existence(self) -> None:
         """What is needless from an existence on falls as it is raised, beginning with all."""
         found = run_experiment(study(GHOSTS, runs=3), [SAMPLE])
-        for row in found.accuracy["lists.parquet"].to_pylist():
+        for row in study_accuracy(found)["lists.parquet"].to_pylist():
             by = np.array(row["needless_s_at"])
             assert len(by) == len(row["existence"])
             assert by[0] == pytest.approx(row["needless_s"])
@@ -774,15 +775,15 @@ class TestStudies:
         plan = study(
             {"clean": [SEES]}, runs=1, configurations={"late": late, "gnn": late | {"fusion": {"kind": "gnn"}}}
         )
-        for row in run_experiment(plan, [SAMPLE]).accuracy["lists.parquet"].to_pylist():
+        for row in study_accuracy(run_experiment(plan, [SAMPLE]))["lists.parquet"].to_pylist():
             assert (row["lists"], row["needless_brakes"], row["needless_s"], row["driving_s"]) == (0, 0, 0, 8)
             assert row["must_brake_missed_s"] == row["must_brake_s"] == pytest.approx(1.2)
 
     @pytest.mark.parametrize("changes", [{"braking": None}, {"braking": BRAKING_8 | {"needless": None}}])
     def test_not_asked_for(self, changes: dict[str, Any]) -> None:
         found = run_experiment(study({"clean": [SEES]}, runs=1, **changes), [SAMPLE])
-        assert "needless.parquet" not in found.accuracy
-        assert not {"driving_s", "needless_s"} & set(found.accuracy["lists.parquet"].column_names)
+        assert "needless.parquet" not in study_accuracy(found)
+        assert not {"driving_s", "needless_s"} & set(study_accuracy(found)["lists.parquet"].column_names)
         assert not [name for name in found.summary if "needless" in name or name == "driving_h"]
 
     def test_nor_without_accuracy(self) -> None:
@@ -876,7 +877,7 @@ class TestSame:
 
     def tables(self, **more: Any) -> dict[str, pa.Table]:
         found = run_experiment(self.PLAN, [SAMPLE], **more)
-        return {name: found.accuracy[name] for name in ("lists.parquet", "needless.parquet")}
+        return {name: study_accuracy(found)[name] for name in ("lists.parquet", "needless.parquet")}
 
     def test_whatever_the_jobs_and_time_chunks(self, monkeypatch: pytest.MonkeyPatch) -> None:
         whole = self.tables()
@@ -912,7 +913,7 @@ class TestSame:
                 configurations={"all": {"units": ["u_ghosts", "others"], "fusion": {"kind": "gnn"}}},
                 measure={"onset": {"kind": "in_range", "range_m": 60}},
             )  # fmt: skip
-            found = run_experiment(plan, [log], jobs=jobs).accuracy
+            found = study_accuracy(run_experiment(plan, [log], jobs=jobs))
             tables.append([found[name].to_pandas() for name in ("lists.parquet", "needless.parquet")])
         for many, few in zip(*tables, strict=True):
             pd.testing.assert_frame_equal(many[many["run"] < 2].reset_index(drop=True), few, check_exact=True)
@@ -921,7 +922,8 @@ class TestSame:
     def test_kept_parts(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)
         for runs in (4, 6, 6):
-            found = cr.run(self.PLAN.model_copy(update={"runs": runs}), [SAMPLE], pieces="kept").study.accuracy
+            results = cr.run(self.PLAN.model_copy(update={"runs": runs}), [SAMPLE], pieces="kept")
+            found = study_accuracy(results.study)
         for name, table in self.tables().items():
             assert found[name].equals(table), name
 

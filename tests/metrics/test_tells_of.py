@@ -25,6 +25,7 @@ from copem_replay.fusion.union import Union
 from copem_replay.io.recording import read_log
 from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, match_at_both_times, match_entries
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from tests.metrics.test_matching import by_the_rules
@@ -219,7 +220,7 @@ def late(latency_s: Any, *names: str, **more: Any) -> Any:
 
 
 def test_latency_costs_its_length_by_match_as_by_truth_id() -> None:
-    result = late(0.5).table
+    result = study_rows(late(0.5))
     of = {name: part.set_index(["run", "object_id"])["detection_s"] for name, part in result.groupby("configuration")}
     for name in ("union", "gnn"):
         pd.testing.assert_series_equal(of[name], of["ideal"], check_names=False)
@@ -229,8 +230,8 @@ def test_no_row_depends_on_other_configurations() -> None:
     both = late(0.5)
     for name in ("ideal", "union", "tracker"):
         alone = late(0.5, name)
-        mine = both.table[both.table["configuration"] == name].reset_index(drop=True)
-        pd.testing.assert_frame_equal(alone.table, mine, check_exact=True)
+        mine = study_rows(both)[study_rows(both)["configuration"] == name].reset_index(drop=True)
+        pd.testing.assert_frame_equal(study_rows(alone), mine, check_exact=True)
         of = both.summary[both.summary["configuration"] == name].reset_index(drop=True)
         pd.testing.assert_frame_equal(alone.summary, of, check_exact=True, check_dtype=False)
 

@@ -24,6 +24,7 @@ from copem_replay.pipeline.notes import list_oddities
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.metrics.test_conflict import corridor_of, swept
 
@@ -255,8 +256,8 @@ class TestInARun:
         every = experiment(measure=APPEARS, **more)
         some = experiment(measure=APPEARS | {"objects": {"within": {"corridor_m": 5}}}, **more)
         whole, part = (run_experiment(plan, [passing()]) for plan in (every, some))
-        mine = whole.table[whole.table["object_id"] == "parked"].reset_index(drop=True)
-        pd.testing.assert_frame_equal(mine, part.table, check_exact=True)
+        mine = study_rows(whole)[study_rows(whole)["object_id"] == "parked"].reset_index(drop=True)
+        pd.testing.assert_frame_equal(mine, study_rows(part), check_exact=True)
         ghosts = [of.summary["false_positives_per_min"].tolist() for of in (whole, part)]
         assert ghosts[0] == ghosts[1]
         said = "objects.within: 3 of 4 objects with an onset left out, more than 5 m beside the ego's way ahead"
@@ -295,7 +296,10 @@ class TestInARun:
         assert 0 < fewer[1] < fewer[0] / 2
         assert near.summary["gospa_false_m"][0] < whole.summary["gospa_false_m"][0]
         pd.testing.assert_frame_equal(
-            *(of.table[["object_id", "run", "detection_s", "matched_lists", "position_rmse_m"]] for of in (whole, near))
+            *(
+                study_rows(of)[["object_id", "run", "detection_s", "matched_lists", "position_rmse_m"]]
+                for of in (whole, near)
+            )
         )
         assert any("entries at no object where the truth is not annotated, no ghosts" in note for note in near.notes)
 

@@ -31,7 +31,7 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
-from tests.helpers.replays import world_of
+from tests.helpers.replays import study_rows, world_of
 from tests.helpers.scenes import SEES_ALL, Thing, experiment, standing
 
 PEDESTRIAN, BICYCLE = CLASSES.index("pedestrian"), CLASSES.index("bicycle")
@@ -106,8 +106,8 @@ class TestClasses:
     def test_ideal_fusion_keeps_the_true_class(self) -> None:
         sure, wrong = plan_of({}), plan_of({"classes": {"confusion": {"pedestrian": {"car": 1.0}}}})
         told, mistaken = (
-            run_experiment(sure, [standing_child(2.0)]).table,
-            run_experiment(wrong, [standing_child(2.0)]).table,
+            study_rows(run_experiment(sure, [standing_child(2.0)])),
+            study_rows(run_experiment(wrong, [standing_child(2.0)])),
         )
         of = told["configuration"].isin(["GT", "ideal"])
         assert told[of].equals(mistaken[of])

@@ -22,7 +22,7 @@ from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, source_of
-from tests.helpers.replays import world_of
+from tests.helpers.replays import study_accuracy, study_rows, world_of
 from tests.helpers.scenes import SEES_60_M, Thing, driving, experiment, standing
 
 FIELD = {"kind": "field", "range_m": [3, 60], "azimuth_deg": [-60, 60]}
@@ -223,13 +223,13 @@ class TestWhatTheyLeave:
 
     def test_ideal_fusion_and_the_truth_do_not_know_of_them(self) -> None:
         ghosts, none = self.both()
-        for mine, theirs in ((ghosts.table, none.table), (ghosts.summary, none.summary)):
+        for mine, theirs in ((study_rows(ghosts), study_rows(none)), (ghosts.summary, none.summary)):
             pd.testing.assert_frame_equal(
                 comparable(mine, "GT", "ideal"), comparable(theirs, "GT", "ideal"), check_exact=True
             )
-        assert ghosts.accuracy
-        assert none.accuracy
-        mine, theirs = (one.accuracy["accuracy.parquet"].to_pandas() for one in (ghosts, none))
+        assert study_accuracy(ghosts)
+        assert study_accuracy(none)
+        mine, theirs = (study_accuracy(one)["accuracy.parquet"].to_pandas() for one in (ghosts, none))
         pd.testing.assert_frame_equal(
             comparable(mine, "GT", "ideal"), comparable(theirs, "GT", "ideal"), check_exact=True
         )
@@ -240,10 +240,10 @@ class TestWhatTheyLeave:
     def test_a_run_alone_is_the_same_run(self) -> None:
         plan = plan_of({"in_list": 1.0, "lasts_s": 0.7, "where": FIELD}, runs=4, pem={"couples": self.NOISE})
         one, two = run_experiment(plan, [self.RECORDING], jobs=1), run_experiment(plan, [self.RECORDING], jobs=2)
-        pd.testing.assert_frame_equal(one.table, two.table, check_exact=True)
+        pd.testing.assert_frame_equal(study_rows(one), study_rows(two), check_exact=True)
         fewer = run_experiment(plan.model_copy(update={"runs": 2}), [self.RECORDING])
-        first = one.table[one.table["run"] < 2].reset_index(drop=True)
-        pd.testing.assert_frame_equal(first, fewer.table.reset_index(drop=True), check_exact=True)
+        first = study_rows(one)[study_rows(one)["run"] < 2].reset_index(drop=True)
+        pd.testing.assert_frame_equal(first, study_rows(fewer).reset_index(drop=True), check_exact=True)
 
 
 class TestEachBirthIsAnother:

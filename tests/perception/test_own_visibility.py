@@ -18,6 +18,7 @@ from copem_replay.perception.visibility import Flat, Observers, Statics, Visibil
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
+from tests.helpers.replays import study_rows
 from tests.helpers.report_pages import TEXT, replayed
 from tests.helpers.scenes import experiment
 
@@ -53,13 +54,13 @@ def foggy(**changes: Any) -> Experiment:
 
 def test_it_decides_what_is_detected_and_in_sight() -> None:
     """The other car is 80 m away at 2 s and comes at 10 m/s: at 5.5 s it is 45 m away."""
-    table = run_experiment(foggy(), [scenes.oncoming_car()]).table.set_index("configuration")
+    table = study_rows(run_experiment(foggy(), [scenes.oncoming_car()])).set_index("configuration")
     assert table.loc["PEM", ["onset_s", "detection_s", "in_sight_s"]].tolist() == pytest.approx([2.0, 5.5, 5.5])
 
 
 def test_it_decides_when_the_clock_starts() -> None:
     plan = foggy(measure={"onset": {"kind": "line_of_sight", "visible_share": 0.5}})
-    assert run_experiment(plan, [scenes.oncoming_car()]).table["onset_s"].tolist() == pytest.approx([5.5, 5.5])
+    assert study_rows(run_experiment(plan, [scenes.oncoming_car()]))["onset_s"].tolist() == pytest.approx([5.5, 5.5])
 
 
 def test_what_hides_is_nothing_unless_it_says_so() -> None:

@@ -21,7 +21,7 @@ from copem_replay.pipeline.receiver import StatedCaptures
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive, source_of
-from tests.helpers.replays import world_of
+from tests.helpers.replays import study_accuracy, study_rows, world_of
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
 EGO = Thing("ego", "car", standing(0, 20))
@@ -84,8 +84,8 @@ class TestOutages:
         result = run_experiment(plan, [alone(10.0)])
         rates = result.summary["list_rate_hz"]
         assert (rates < 9.9).all()
-        assert result.accuracy
-        instants, lists = (result.accuracy[name].to_pandas() for name in ("instants.parquet", "lists.parquet"))
+        assert study_accuracy(result)
+        instants, lists = (study_accuracy(result)[name].to_pandas() for name in ("instants.parquet", "lists.parquet"))
         assert instants["run"].tolist() == lists["run"].tolist()  # each run has its own
         assert instants["available_s"].map(len).tolist() == lists["lists"].tolist()
 
@@ -104,7 +104,7 @@ class TestOutages:
         never = experiment(units={"mast": unit(rate_hz=50.0, outages={"down_share": 0.0, "lasts_s": 0.5})}).units
         result = run_experiment(without, [alone(4.0)])
         other = run_experiment(plan.model_copy(update={"units": never}), [alone(4.0)])
-        assert result.table.equals(other.table)
+        assert study_rows(result).equals(study_rows(other))
         assert result.summary.equals(other.summary)
 
 
@@ -161,13 +161,15 @@ class TestClock:
             run_experiment(experiment(units={"mast": unit()}, **changes), [recording]),
         )
         [error_s] = np.unique(
-            clock_errors_s(clocks.replays[0].scene, ("mast",), off, np.zeros(1), np.zeros(1, dtype=int), 0)  # type: ignore[arg-type]
+            clock_errors_s(clocks.logs[0].replay().scene, ("mast",), off, np.zeros(1), np.zeros(1, dtype=int), 0)  # type: ignore[arg-type]
         )
         assert error_s > 0.005
-        assert exact.table["position_rmse_captured_m"].item() < 1e-6
-        assert clocks.table["position_rmse_captured_m"].item() == pytest.approx(10 * error_s, rel=1e-3)
+        assert study_rows(exact)["position_rmse_captured_m"].item() < 1e-6
+        assert study_rows(clocks)["position_rmse_captured_m"].item() == pytest.approx(10 * error_s, rel=1e-3)
         for column in ("detection_s", "captured_s", "age_of_information_s"):
-            assert clocks.table[column].item() == pytest.approx(exact.table[column].item(), abs=1e-9), column
+            assert study_rows(clocks)[column].item() == pytest.approx(study_rows(exact)[column].item(), abs=1e-9), (
+                column
+            )
 
     SIGMA_S = 0.05
 
@@ -202,7 +204,7 @@ class TestClock:
         """The unit sees all: who is there is listed, whatever the clock says, and known when the list arrives."""
         exact, off = self.compared(fusion)
         keys = ["object_id", "run"]
-        both = exact.table.merge(off.table, on=keys, suffixes=("", "_off"))
+        both = study_rows(exact).merge(study_rows(off), on=keys, suffixes=("", "_off"))
         assert len(both) == 60 * 10
         late_s = both["detection_s_off"] - both["detection_s"]
         assert not late_s.isna().any()
@@ -230,7 +232,7 @@ class TestClock:
             run_experiment(experiment(units={"mast": unit(**clock)}, **of), [self.early_and_late()])
             for clock in ({}, {"clock": {"offset_sigma_s": 0.0}})
         )
-        assert without.table.equals(nothing.table)
+        assert study_rows(without).equals(study_rows(nothing))
         assert without.summary.equals(nothing.summary)
 
     def test_ideal_fusion_does_not_know_of_it_and_is_said_not_to(self) -> None:
@@ -241,7 +243,7 @@ class TestClock:
         without = run_experiment(
             experiment(units={"mast": unit()}, configurations={"PEM": {"units": "all"}}), [alone(2.0)]
         )
-        assert result.table.equals(without.table)
+        assert study_rows(result).equals(study_rows(without))
         assert (
             "scene: configuration PEM: ideal fusion uses true captures, ignoring clock errors of mast" in result.notes
         )

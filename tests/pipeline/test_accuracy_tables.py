@@ -15,6 +15,7 @@ from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.scoring import DISTANCE_EDGES_M, EXISTENCE_THRESHOLDS
+from tests.helpers.replays import study_accuracy, study_rows
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
 KEYS = ["log", "configuration", "run", "object_id"]
@@ -62,8 +63,8 @@ def result() -> StudyTables:
 
 
 def tables(of: StudyTables) -> dict[str, pa.Table]:
-    assert of.accuracy
-    return of.accuracy
+    assert study_accuracy(of)
+    return study_accuracy(of)
 
 
 def rows(of: StudyTables, configuration: str, name: str = "accuracy") -> pd.DataFrame:
@@ -83,7 +84,7 @@ def values(column: pd.Series) -> Any:
 class TestTheSame:
     def test_rows_are_those_of_detections(self, result: StudyTables) -> None:
         for name in ("accuracy", "detections"):
-            table = result.table if name == "detections" else tables(result)["accuracy.parquet"].to_pandas()
+            table = study_rows(result) if name == "detections" else tables(result)["accuracy.parquet"].to_pandas()
             expected = [
                 (log, c, s, o)
                 for log in ("one", "two")
@@ -98,7 +99,7 @@ class TestTheSame:
         instants = tables(result)["instants.parquet"]
         available_s = instants.to_pandas().set_index(["log", "configuration"])["available_s"]
         since_s = {"in": 0.0, "parked": 0.0, "late": 0.7}
-        ended_s = result.table["ended_s"]
+        ended_s = study_rows(result)["ended_s"]
         for name in NAMES:
             for one in rows(result, name).itertuples():
                 times_s = available_s[one.log, name]
@@ -108,7 +109,7 @@ class TestTheSame:
                 assert (times_s[first:last] < until_s + 1e-6).all()
                 assert last == len(times_s) or times_s[last] > until_s
                 assert first == 0 or times_s[first - 1] < since_s[one.object_id]
-                onset_s = result.table["onset_s"][one.Index]
+                onset_s = study_rows(result)["onset_s"][one.Index]
                 looked = ~np.isnan(np.asarray(one.gospa_m2, dtype=float))
                 assert (looked == (times_s[first:last] > onset_s - 1e-6)).all()
 
@@ -130,7 +131,7 @@ class TestTheSame:
 
     def test_columns_of_detections(self, result: StudyTables) -> None:
         for name in NAMES:
-            table = result.table[result.table["configuration"] == name]
+            table = study_rows(result)[study_rows(result)["configuration"] == name]
             errors = [np.asarray(one, dtype=float) for one in rows(result, name)["error_m"]]
             count = np.array([np.count_nonzero(~np.isnan(one)) for one in errors])
             assert table["matched_lists"].tolist() == count.tolist()
@@ -167,7 +168,7 @@ class TestTheSame:
         for name in NAMES:
             steps = rows(result, name, "thresholds")
             first = steps.groupby(KEYS, sort=False)["detection_s"].first()
-            detection_s = result.table[result.table["configuration"] == name].set_index(KEYS)["detection_s"]
+            detection_s = study_rows(result)[study_rows(result)["configuration"] == name].set_index(KEYS)["detection_s"]
             if name in ("GT", "ideal"):
                 assert (first >= detection_s[first.index] - 1e-9).all()
                 assert set(steps["existence"]) == {1.0}
@@ -208,10 +209,10 @@ class TestWhatIsThere:
         plan = experiment(units={"ego": UNITS["ego"]}, pems=pems(), configurations=configurations("gnn"),
                           measure=APPEARS | {"accuracy": False})  # fmt: skip
         result = run_experiment(plan, [street("one", 10)])
-        assert not result.accuracy
+        assert not study_accuracy(result)
         assert "position_rmse_m" not in result.summary
-        assert "matched_lists" not in result.table
-        assert result.table["detected"].all()
+        assert "matched_lists" not in study_rows(result)
+        assert study_rows(result)["detected"].all()
 
     def test_fleets(self) -> None:
         """Each run has other units, so other instants, which are told by run; whatever the blocks."""
@@ -221,7 +222,7 @@ class TestWhatIsThere:
         result = run_experiment(plan, [street("one", 10)])
         assert len(set(rows(result, "union", "lists")["lists"])) > 1
         for name in ("GT", "ideal", "union", "gnn"):
-            table, found = result.table[result.table["configuration"] == name], figures(result, name)
+            table, found = study_rows(result)[study_rows(result)["configuration"] == name], figures(result, name)
             square_m2 = (table["matched_lists"] * table["position_rmse_m"].fillna(0) ** 2).sum()
             rmse_m = np.sqrt(square_m2 / table["matched_lists"].sum())
             assert rmse_m == pytest.approx(found["position_rmse_m"])
@@ -230,7 +231,9 @@ class TestWhatIsThere:
             assert lists["run"].tolist() == list(range(8))
             instants = rows(result, name, "instants")
             assert instants["run"].tolist() == list(range(8))
-            late = instants["available_s"].map(lambda of: sum(t > 1e-6 + result.replays[0].scene.end_s for t in of))
+            late = instants["available_s"].map(
+                lambda of: sum(t > 1e-6 + result.logs[0].replay().scene.end_s for t in of)
+            )
             assert (instants["available_s"].map(len) - late).tolist() == lists["lists"].tolist()
             errors = rows(result, name)
             pd.testing.assert_frame_equal(
@@ -250,7 +253,7 @@ class TestWhatIsThere:
         pd.testing.assert_frame_equal(result.summary, other.summary, check_exact=True)
         for name, table in tables(result).items():
             assert table.equals(tables(other)[name]), name
-        pd.testing.assert_frame_equal(result.table, other.table, check_exact=True)
+        pd.testing.assert_frame_equal(study_rows(result), study_rows(other), check_exact=True)
         assert result.bands is not None
         assert result.bands.equals(other.bands)
 
@@ -271,7 +274,7 @@ class TestInTheHead:
         )
         result = run_experiment(plan, [still(*others)])
         late_s = 0.1 if kind == "tracker" else 0.0
-        assert result.table["detection_s"].tolist() == [0.0] * 6 + [pytest.approx(late_s)] * 3
+        assert study_rows(result)["detection_s"].tolist() == [0.0] * 6 + [pytest.approx(late_s)] * 3
         for figure in (
             "position_rmse_m",
             "position_rmse_captured_m",
@@ -299,7 +302,7 @@ class TestInTheHead:
         assert rows(result, "union", "lists")[["lists", "duplicates", "ghosts"]].to_numpy().tolist() == [[21, 21, 0]]
         for kind in ("nms", "gnn"):
             assert rows(result, kind, "lists")[["lists", "duplicates", "ghosts"]].to_numpy().tolist() == [[21, 0, 0]]
-        assert set(result.table["matched_lists"]) == {21}
+        assert set(study_rows(result)["matched_lists"]) == {21}
 
     def test_an_entry_is_about_its_object_within_the_gate_and_that_of_ideal_fusion_anywhere(self) -> None:
         """By hand: the first list from the onset on in which the place is at most 3 m off."""
@@ -307,7 +310,7 @@ class TestInTheHead:
         common: Any = {"pems": pems(1.0, 2.5), "runs": 30, "configurations": configurations("union")}
         common["units"] = {"ego": UNITS["ego"]}
         plan = experiment(measure=measure, **common)
-        by_id = run_experiment(plan, [still()]).table.set_index("configuration")
+        by_id = study_rows(run_experiment(plan, [still()])).set_index("configuration")
         assert set(by_id.loc["ideal", "detection_s"]) == {0.5}
         expected_s = []
         for k in range(30):

@@ -21,6 +21,7 @@ from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.visibility import NO_STATICS
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
+from tests.helpers.replays import study_accuracy, study_rows
 from tests.helpers.scenes import EGO_UNIT, SEES_60_M, Thing, driving, experiment, recording, standing
 from tests.system.test_cli import Call, call, here
 
@@ -130,7 +131,7 @@ def test_who_is_out_for_less_is_still_there(again_after_s: float, episodes: int)
 def test_times_of_every_episode_are_its_own() -> None:
     """Half a second after each onset, whichever way detections are found; nothing is known from the time before."""
     result = run_experiment(plan(), [site()])
-    table = result.table[result.table["object_id"] == "car"]
+    table = study_rows(result)[study_rows(result)["object_id"] == "car"]
     assert of(result, "GT")["n"] == 11
     for name, late_s in (("GT", 0.0), ("late", 0.5), ("gnn", 0.5), ("hits", 0.0)):
         rows = table[table["configuration"] == name]
@@ -150,9 +151,12 @@ def test_earlier_lists_count_from_the_end_of_the_episode_before() -> None:
     of_30_m = {"kind": "in_range", "range_m": 30, "again_after_s": 10}
     configurations = {"PEM": {"units": ["ego"]}, "union": {"units": ["ego"], "fusion": {"kind": "union"}}}
     measure = {"onset": of_30_m, "count_earlier": True}
-    table = run_experiment(
-        plan(configurations=configurations, measure=measure, pems={"sure": SEES_60_M}, units={"ego": EGO_UNIT}), [log]
-    ).table
+    table = study_rows(
+        run_experiment(
+            plan(configurations=configurations, measure=measure, pems={"sure": SEES_60_M}, units={"ego": EGO_UNIT}),
+            [log],
+        )
+    )
     assert table["onset_s"].to_numpy() == pytest.approx([18.0, 58.0] * 2)
     # After the first episode it drives on and is listed to 60 m: those lists tell of its leaving, but count.
     assert table["time_to_detection_s"].to_numpy() == pytest.approx([-3.0, -35.9] * 2)
@@ -174,13 +178,13 @@ def test_accuracy_is_of_each_object_once() -> None:
     for name in ("position_rmse_m", "gospa_m", "missed_share", "false_positives_per_min", "longest_gap_s"):
         if name in one.summary:
             assert one.summary[name].to_list() == pytest.approx(again.summary[name].to_list(), nan_ok=True), name
-    assert one.accuracy
-    assert again.accuracy
-    lengths = [len(values) for values in again.accuracy["accuracy.parquet"]["error_m"].to_pylist()]
-    later = again.table["episode"].to_numpy() > 0
+    assert study_accuracy(one)
+    assert study_accuracy(again)
+    lengths = [len(values) for values in study_accuracy(again)["accuracy.parquet"]["error_m"].to_pylist()]
+    later = study_rows(again)["episode"].to_numpy() > 0
     assert not np.array(lengths)[later].any()
-    kept = again.accuracy["accuracy.parquet"].filter(~later).drop_columns(["episode"])
-    assert kept.equals(one.accuracy["accuracy.parquet"].drop_columns(["episode"]))
+    kept = study_accuracy(again)["accuracy.parquet"].filter(~later).drop_columns(["episode"])
+    assert kept.equals(study_accuracy(one)["accuracy.parquet"].drop_columns(["episode"]))
 
 
 def test_who_was_gone_appears_again() -> None:

@@ -33,7 +33,7 @@ from copem_replay.pipeline.receiver import Reach, Receivers
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
 from tests.helpers.recordings import Obj, pedestrian, write_recording
-from tests.helpers.replays import transmitted
+from tests.helpers.replays import study_accuracy, study_rows, transmitted
 from tests.helpers.scenes import Thing, driving, experiment, standing
 from tests.io import test_recorded_units as test_recorded
 from tests.viewer.test_rrd import rows
@@ -69,17 +69,17 @@ def both_ways(plan: Experiment, recordings: Sequence[Recording], rows_at_once: i
 
 
 def assert_same(whole: StudyTables, pieces: StudyTables) -> None:
-    assert [replay.chunks for replay in whole.replays] == [(TimeChunk(),)] * len(whole.replays)
-    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
+    assert [log.replay().chunks for log in whole.logs] == [(TimeChunk(),)] * len(whole.logs)
+    pd.testing.assert_frame_equal(study_rows(whole), study_rows(pieces), check_exact=True)
     pd.testing.assert_frame_equal(whole.summary, pieces.summary, check_exact=True)
     assert whole.notes == pieces.notes
     assert (whole.sweep is None) == (pieces.sweep is None)
     if whole.sweep is not None:
         pd.testing.assert_frame_equal(whole.sweep, pieces.sweep, check_exact=True)
-    assert whole.accuracy
-    assert pieces.accuracy
+    assert study_accuracy(whole)
+    assert study_accuracy(pieces)
     pd.testing.assert_frame_equal(whole.bands, pieces.bands, check_exact=True)
-    assert_same_tables(whole.accuracy, pieces.accuracy)
+    assert_same_tables(study_accuracy(whole), study_accuracy(pieces))
 
 
 def assert_same_tables(whole: dict[str, pa.Table], pieces: dict[str, pa.Table]) -> None:
@@ -97,7 +97,7 @@ def test_the_sample_logs(name: str, rows: int, configurations: int | None) -> No
     plan = plan.model_copy(update={"runs": 2, "configurations": chosen})
     recordings, _ = read_logs(plan, log_paths(source)[0], source)
     whole, pieces = both_ways(plan, recordings, rows)
-    assert len(pieces.replays[0].chunks) > 5
+    assert len(pieces.logs[0].replay().chunks) > 5
     assert_same(whole, pieces)
 
 
@@ -167,7 +167,7 @@ def plans(draw: st.DrawFn) -> Experiment:
 )  # each replays a log twice and compares all
 def test_whatever_is_replayed(plan: Experiment, rows: int) -> None:
     whole, pieces = both_ways(plan, [traffic()], rows)
-    assert len(pieces.replays[0].chunks) > 1
+    assert len(pieces.logs[0].replay().chunks) > 1
     assert_same(whole, pieces)
 
 
@@ -216,7 +216,7 @@ def test_all_that_units_get_wrong(rows: int) -> None:
         },
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], rows)
-    assert len(pieces.replays[0].chunks) > 1
+    assert len(pieces.logs[0].replay().chunks) > 1
     assert_same(whole, pieces)
     parallel = run_experiment(plan, [traffic()], jobs=2)
     assert_same(whole, parallel)
@@ -231,7 +231,7 @@ def test_recorded_units(tmp_path: Path) -> None:
     path = test_recorded.drive(tmp_path / "drive.mcap", *lists)
     plan = test_recorded.plan_of(path, unit={"delay_s": 0.17})
     whole, pieces = both_ways(plan, [test_recorded.read(path, unit={"delay_s": 0.17})], 10)
-    assert len(pieces.replays[0].chunks) > 3
+    assert len(pieces.logs[0].replay().chunks) > 3
     assert_same(whole, pieces)
 
 
@@ -244,11 +244,11 @@ def test_a_foreseen_collision_without_accuracy_holds_only_what_is_looked_at() ->
         },
     )  # fmt: skip
     whole, pieces = both_ways(plan, [traffic()], 60)
-    assert len(pieces.replays[0].chunks) > 5
-    assert whole.table["conflict_detection_s"].notna().any()
-    pd.testing.assert_frame_equal(whole.table, pieces.table, check_exact=True)
-    pedestrians = {whole.replays[0].scene.object_number[name] for name in ("crossing", "blinking")}
-    for replay in (whole.replays[0], pieces.replays[0]):
+    assert len(pieces.logs[0].replay().chunks) > 5
+    assert study_rows(whole)["conflict_detection_s"].notna().any()
+    pd.testing.assert_frame_equal(study_rows(whole), study_rows(pieces), check_exact=True)
+    pedestrians = {whole.logs[0].replay().scene.object_number[name] for name in ("crossing", "blinking")}
+    for replay in (whole.logs[0].replay(), pieces.logs[0].replay()):
         worlds = list(Receivers(transmitted(replay, plan, complete=False)).worlds())
         assert {int(k) for world in worlds for k in world.observations.tracks.row_object_ix} == pedestrians
 
@@ -268,7 +268,7 @@ def test_a_fusion_that_is_not_resumable_gets_all_at_once() -> None:
     }
     plan = experiment(pems={"sure": NOISY}, configurations=own)
     whole, pieces = both_ways(plan, [traffic()], 50)
-    assert pieces.replays[0].chunks == (TimeChunk(),)
+    assert pieces.logs[0].replay().chunks == (TimeChunk(),)
     assert_same(whole, pieces)
 
 
@@ -360,7 +360,7 @@ def test_visible_shares_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("copem_replay.pipeline.replay.CHUNK_BYTES", 1)
     plan = experiment(runs=3, configurations={"late": {"units": "all", "latency_s": 0.4}}, pems={"sure": NOISY})
     result = run_experiment(plan, [traffic()])
-    [replay] = result.replays
+    [replay] = (log.replay() for log in result.logs)
     list(RunTracks(replay, plan, 0))
     rows = len(replay.truth.frame_ix)
     # What a time chunk needs from before it is looked at with it once more: 0.4 s and a list of 6 objects at 10 Hz.

@@ -43,7 +43,7 @@ from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.drawn import examples
 from tests.helpers.experiments import changed, drive, source_of
-from tests.helpers.replays import transmitted
+from tests.helpers.replays import study_rows, transmitted
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 
 ROOT = Path(__file__).parents[2]
@@ -512,7 +512,7 @@ class TestByHand:
         assert result.exact is None
         assert not [name for name in result.summary if name.endswith("_exact")]
         asked = run_experiment(masts(1), [one_walker()])
-        pd.testing.assert_frame_equal(asked.table, result.table)
+        pd.testing.assert_frame_equal(study_rows(asked), study_rows(result))
         pd.testing.assert_frame_equal(asked.summary[list(result.summary)], result.summary)
 
 
@@ -790,7 +790,7 @@ def pairs(result: StudyTables) -> list[tuple[tuple[str, ...], pd.DataFrame, pd.D
     assert result.exact is not None
     keys = ["log", "configuration", "object_id"]
     by = dict(iter(result.exact.groupby(keys)))
-    runs = dict(iter(result.table.groupby(keys)))
+    runs = dict(iter(study_rows(result).groupby(keys)))
     assert by.keys() == runs.keys()
     return [(key, runs[key], by[key]) for key in by]
 
@@ -862,7 +862,7 @@ class TestPassing:
         """The mean verdict over 500 equally probable reactions, by the same judge as the runs."""
         result = replayed_file("tc016d", confirm=None)
         assert result.exact is not None
-        (ready,) = result.replays
+        (ready,) = (log.replay() for log in result.logs)
         (encounter,) = ready.encounters
         braking = ready.expanded.braking
         assert braking is not None
@@ -928,7 +928,7 @@ class TestPassing:
         Who may miss him fails with the mean of that over the instants at which he may be known, in 60 digits.
         """
         result = self.meeting(reaction, 0.9)
-        (between_s,) = result.replays[0].passing_s.values()
+        (between_s,) = result.logs[0].replay().passing_s.values()
         assert between_s[0, 1] == pytest.approx(3.1, abs=1e-4)
         rows = result.summary.set_index("configuration")
         with mp.workdps(60):

@@ -21,6 +21,7 @@ from copem_replay.metrics.onset import BEGAN
 from copem_replay.metrics.summary import describe_began
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.system.test_cli import Call, call, here
 
@@ -69,7 +70,7 @@ def of(result: StudyTables, configuration: str) -> pd.Series:
 
 
 def test_every_row_says_how_it_began_and_all_are_written() -> None:
-    table = replayed().table
+    table = study_rows(replayed())
     assert table.groupby("object_id")["began"].unique().explode().to_dict() == {
         "near": "log_start", "enters": "crossed", "pops": "appeared", "goes": "appeared",
     }  # fmt: skip
@@ -136,7 +137,7 @@ def test_who_is_there_for_one_frame_is_left_out_and_counted() -> None:
     things = [Thing("ego", "car", standing(0, 0)), Thing("enters", "car", driving(80, 0, -10)), blink]
     result = run_experiment(plan(), [recording(things, until_s=12.0)])
     assert of(result, "late")[["n", "detected_share", "unknown_s"]].tolist() == [1, 1.0, pytest.approx(0.5)]
-    assert set(result.table["object_id"]) == {"enters", "blinks"}
+    assert set(study_rows(result)["object_id"]) == {"enters", "blinks"}
     line = describe_began(result.tally, "late", 5.0, ("crossed", "appeared"))
     assert "1 crossed 0.5 s, 0 appeared, 0 log_start;" in line
     assert "; left out, with no frame after the onset: 1;" in line
@@ -206,6 +207,6 @@ def test_an_oracle_of_how_objects_began() -> None:
             if any(near):
                 first = times[0] < ego_s + 0.01
                 expected[f"o{k}"] = "crossed" if not near[0] else "log_start" if first else "appeared"
-        table = run_experiment(plan(), [log]).table
+        table = study_rows(run_experiment(plan(), [log]))
         found = dict(zip(table["object_id"], table["began"], strict=True))
         assert found == expected

@@ -38,6 +38,7 @@ from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.tables import add_row_accuracy
 from tests.helpers.experiments import changed, source_of
 from tests.helpers.recordings import Obj, pedestrian, write_recording
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.pipeline.test_closed_form import band, farthest, in_closed_form, same, sure_to
 
@@ -150,7 +151,7 @@ class TestExpansion:
     def test_latency_by_the_units_name(self) -> None:
         """The pedestrian is known 0.2 s after a capture, by whomever."""
         late = {"late": {"units": ["fleet"], "latency_s": {"fleet": 0.2, "default": 0.05}}}
-        found = run_experiment(plan({"fleet": some(0.7)}, configurations=late), [street()]).table
+        found = study_rows(run_experiment(plan({"fleet": some(0.7)}, configurations=late), [street()]))
         seen = found[found["detected"]]
         assert len(seen) > 20
         np.testing.assert_allclose(seen["detection_s"] - seen["captured_s"], 0.2)
@@ -183,15 +184,15 @@ class TestExpansion:
         """As if there were no such unit."""
         both = {"all": {"units": "all"}, "none": {"units": ["f"]}}
         wanted = plan({"ego": EGO, "f": some(0.9, "bus")}, configurations=both)
-        found = run_experiment(wanted, [street()]).table
-        alone = run_experiment(plan({"ego": EGO}), [street()]).table
+        found = study_rows(run_experiment(wanted, [street()]))
+        alone = study_rows(run_experiment(plan({"ego": EGO}), [street()]))
         pd.testing.assert_frame_equal(times(found, "all"), times(alone, "all"))
         assert not found[found["configuration"] == "none"]["detected"].any()
 
     def test_each_log_has_carriers_of_its_own(self) -> None:
         other = street([Thing("ego", "car", standing(0, 0)), Thing("w", "pedestrian", standing(5, 5)),
                         Thing("x", "car", standing(9, 9))], log="other")  # fmt: skip
-        found = run_experiment(plan({"f": some(0.9)}), [street(), other]).table
+        found = study_rows(run_experiment(plan({"f": some(0.9)}), [street(), other]))
         seen = found.dropna(subset="first_unit").groupby("log")["first_unit"].unique()
         assert set(seen["scene"]) == {"f:12", "f:3", "f:b"}
         assert set(seen["other"]) == {"f:x"}
@@ -311,7 +312,7 @@ class TestRuns:
         """A share of 0 is the configuration without it."""
         units = {"ego": EGO, "fleet": some(0.0)}
         wanted = plan(units, configurations=CONFIGURATIONS, measure=MEASURE | {"confirm": confirm})
-        found = run_experiment(wanted, [on_the_move()]).table
+        found = study_rows(run_experiment(wanted, [on_the_move()]))
         pd.testing.assert_frame_equal(times(found, "all"), times(found, "ego"))
         assert not found[found["configuration"] == "fleet"]["detected"].any()
         assert set(found["first_unit"].dropna()) == {"ego"}
@@ -329,7 +330,7 @@ class TestRuns:
         )
         log = on_the_move()
         pd.testing.assert_frame_equal(
-            run_experiment(whole, [log]).table, run_experiment(each, [log]).table, check_exact=True
+            study_rows(run_experiment(whole, [log])), study_rows(run_experiment(each, [log])), check_exact=True
         )
         assert measure_list_rates(prepare_log(log, whole), whole) == measure_list_rates(prepare_log(log, each), each)
 
@@ -358,13 +359,13 @@ class TestRuns:
             whole.sort_values(order, ignore_index=True), parts.sort_values(order, ignore_index=True)
         )
         log = on_the_move()
-        assert run_experiment(wanted, [log], jobs=2).table.equals(run_experiment(wanted, [log]).table)
+        assert study_rows(run_experiment(wanted, [log], jobs=2)).equals(study_rows(run_experiment(wanted, [log])))
 
     def test_more_carriers_are_never_later(self) -> None:
         """By the same draws, run by run and object by object."""
         shares = (0.0, 0.2, 0.5, 0.9, 1.0)
         found = [
-            times(run_experiment(plan({"ego": EGO, "fleet": some(s)}, runs=200), [on_the_move()]).table, "all")
+            times(study_rows(run_experiment(plan({"ego": EGO, "fleet": some(s)}, runs=200), [on_the_move()])), "all")
             for s in shares
         ]
         for fewer, more in itertools.pairwise(found):
@@ -372,15 +373,17 @@ class TestRuns:
         assert (found[-1]["detection_s"].fillna(np.inf) < found[0]["detection_s"].fillna(np.inf)).any()
 
     def test_a_fleet_leaves_the_draws_of_others_as_they_are(self) -> None:
-        without = run_experiment(plan({"ego": EGO}, configurations={"ego": {"units": ["ego"]}}), [on_the_move()]).table
+        without = study_rows(
+            run_experiment(plan({"ego": EGO}, configurations={"ego": {"units": ["ego"]}}), [on_the_move()])
+        )
         wanted = plan({"fleet": some(0.5), "ego": EGO}, configurations=CONFIGURATIONS)
-        found = run_experiment(wanted, [on_the_move()]).table
+        found = study_rows(run_experiment(wanted, [on_the_move()]))
         pd.testing.assert_frame_equal(times(found, "ego"), times(without, "ego"))
 
     def test_the_order_of_objects_does_not_matter(self) -> None:
         log = on_the_move()
         wanted = plan({"ego": EGO, "fleet": some(0.5)}, configurations=CONFIGURATIONS)
-        usual = run_experiment(wanted, [log]).table
+        usual = study_rows(run_experiment(wanted, [log]))
         members = [
             Thing("v", "pedestrian", driving(30, -8, 0, 1), lambda t: t > 0.75),
             Thing("3", "car", driving(60, -4, -8), lambda t: not 0.45 < t < 1.35),
@@ -388,7 +391,7 @@ class TestRuns:
             Thing("12", "car", driving(40, 4, -6), lambda t: t < 1.15),
             Thing("ego", "car", driving(0, 0, 5)),
         ]
-        turned = run_experiment(wanted, [street(members, until_s=2.0)]).table
+        turned = study_rows(run_experiment(wanted, [street(members, until_s=2.0)]))
         order = ["configuration", "run", "object_id"]
         columns = [name for name in usual if name != "first_unit"]  # of two at one instant the experiment's first
         pd.testing.assert_frame_equal(
@@ -457,7 +460,7 @@ class TestRuns:
     def test_conflicts_foreseen_by_nobody_else(self) -> None:
         """With a share of 0 a conflict is foreseen when the ego alone foresees it: at its own lists."""
         wanted, log = self.meeting(0.0, {})
-        found = run_experiment(wanted, [log]).table.set_index(["run", "object_id"])
+        found = study_rows(run_experiment(wanted, [log])).set_index(["run", "object_id"])
         alone, everyone = (found.loc[found["configuration"] == name, "conflict_detection_s"] for name in ("ego", "all"))
         assert alone.notna().any()
         pd.testing.assert_series_equal(everyone, alone)
@@ -478,7 +481,7 @@ def block(ready: Replay, wanted: Experiment, runs: Int) -> pd.DataFrame:
 
 def one_by_one(wanted: Experiment, log: Recording) -> None:
     """Each run, replayed with its own units alone, gives the rows that it has among the others."""
-    whole = run_experiment(wanted, [log]).table
+    whole = study_rows(run_experiment(wanted, [log]))
     for _, part in whole.groupby("configuration"):
         assert part["run"].is_monotonic_increasing
     for k in range(wanted.runs):
@@ -574,7 +577,7 @@ class TestClosedForm:
         result = run_experiment(wanted, [street(members)])
         assert result.exact is not None
         assert [p for p in result.exact["probability"] if p > 0] == [0.5, 0.5]
-        assert set(result.table["time_to_detection_s"].dropna()) == {0.0}
+        assert set(study_rows(result)["time_to_detection_s"].dropna()) == {0.0}
         row = result.summary.iloc[0]
         assert row["detected_share_exact"] == 0.5
         assert row["detected_share_low"] < 0.5 < row["detected_share_high"]
@@ -590,7 +593,7 @@ class TestClosedForm:
         result = run_experiment(wanted, [on_the_move()])
         assert result.exact is not None
         keys = ["configuration", "object_id"]
-        runs = dict(iter(result.table.groupby(keys)))
+        runs = dict(iter(study_rows(result).groupby(keys)))
         parts = dict(iter(result.exact.groupby(keys)))
         assert len(parts) == 4 * 2
         for key, part in parts.items():

@@ -24,6 +24,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.detection.by_truth_id import detect_by_truth_id
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, experiment, recording, standing
 from tests.oracles import ideal
 from tests.oracles.accuracy import episodes_of
@@ -186,7 +187,7 @@ def z_scores(plan: Experiment, log: Recording, name: str) -> Float:
     assert result.exact is not None
     exact = result.exact[(result.exact["configuration"] == name) & (result.exact["probability"] > 0)]
     exact = exact[exact["detection_s"].notna()]
-    table = result.table[result.table["configuration"] == name]
+    table = study_rows(result)[study_rows(result)["configuration"] == name]
     n = len(table)
     objects = table["object_id"].nunique()
     z = []

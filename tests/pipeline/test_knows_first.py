@@ -23,6 +23,7 @@ from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import PEDESTRIAN, Obj, Topic, pedestrian, write_recording
+from tests.helpers.replays import study_rows
 from tests.io.test_recorded_units import list_of
 
 PLACE = "tests.pipeline.test_knows_first"
@@ -179,7 +180,7 @@ def test_the_ideal_knows_first(tmp_path_factory: pytest.TempPathFactory, seed: i
     plan = draw_experiment(path, rng, recorded=recorded)
     recordings, refused = read_logs(plan, [path], None)
     assert not refused, refused
-    rows = run_experiment(plan, recordings).table
+    rows = study_rows(run_experiment(plan, recordings))
     if rows.empty:  # nobody comes near
         return
     known = rows.set_index(["object_id", "episode", "run", "configuration"])["detection_s"].unstack().fillna(np.inf)
@@ -244,7 +245,9 @@ def test_who_is_always_listed_is_confirmed_at_the_list_at_which_the_ideal_confir
     experiment = Experiment.model_validate(plan)
     recordings, refused = read_logs(experiment, [path], None)
     assert not refused, refused
-    known = run_experiment(experiment, recordings).table.set_index(["object_id", "episode", "run", "configuration"])
+    known = study_rows(run_experiment(experiment, recordings)).set_index(
+        ["object_id", "episode", "run", "configuration"]
+    )
     detection_s = known["detection_s"].unstack()
     for name in ("gnn", "nms", "union"):
         np.testing.assert_allclose(detection_s[name], detection_s["ideal"], rtol=0, atol=1e-9, err_msg=name)

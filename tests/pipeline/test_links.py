@@ -25,7 +25,7 @@ from copem_replay.pipeline.replay import replay_outcomes
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from copem_replay.pipeline.sweep import list_points
 from tests.helpers import scenes
-from tests.helpers.replays import transmitted, world_of
+from tests.helpers.replays import study_accuracy, study_rows, transmitted, world_of
 from tests.helpers.scenes import Thing, driving, experiment, standing
 
 GAMMA = {"kind": "gamma", "min_s": 0.02, "mean_s": 0.06, "shape": 2}
@@ -65,14 +65,14 @@ def heard_by(experiment: Experiment, name: str = "coop", one: int = 0, recording
 
 
 def assert_same(one: StudyTables, other: StudyTables) -> None:
-    columns = [name for name in one.table if name in other.table]  # one may have no link
-    assert one.table[columns].equals(other.table[columns])
+    columns = [name for name in study_rows(one) if name in study_rows(other)]  # one may have no link
+    assert study_rows(one)[columns].equals(study_rows(other)[columns])
     columns = [name for name in one.summary if name in other.summary]
     assert one.summary[columns].equals(other.summary[columns])
-    assert one.accuracy
-    assert other.accuracy
-    assert one.accuracy["instants.parquet"].equals(other.accuracy["instants.parquet"])
-    assert one.accuracy["lists.parquet"].equals(other.accuracy["lists.parquet"])
+    assert study_accuracy(one)
+    assert study_accuracy(other)
+    assert study_accuracy(one)["instants.parquet"].equals(study_accuracy(other)["instants.parquet"])
+    assert study_accuracy(one)["lists.parquet"].equals(study_accuracy(other)["lists.parquet"])
 
 
 def test_a_link_that_is_sure_is_a_latency_to_the_last_bit() -> None:
@@ -183,7 +183,7 @@ def test_a_log_in_time_chunks_gives_the_same(monkeypatch: pytest.MonkeyPatch, fl
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
     cut = run_experiment(some, [traffic()])
-    assert len(cut.replays[0].chunks) > 2
+    assert len(cut.logs[0].replay().chunks) > 2
     assert_same(whole, cut)
 
 
@@ -216,7 +216,7 @@ def test_lists_queue_for_as_long_as_they_are_in_their_run() -> None:
 
 def test_nothing_is_known_sooner_than_without_the_link() -> None:
     configurations = {"plain": {"units": "all"}, "coop": {"units": "all", "link": "v2x"}}
-    table = run_experiment(plan(None, configurations=configurations, runs=20), [traffic()]).table
+    table = study_rows(run_experiment(plan(None, configurations=configurations, runs=20), [traffic()]))
     plain, coop = (table[table["configuration"] == name]["detection_s"].to_numpy() for name in configurations)
     assert (np.nan_to_num(coop, nan=np.inf) >= np.nan_to_num(plain, nan=np.inf)).all()
     assert (coop > plain).any()
@@ -235,7 +235,7 @@ def one_car(loss: float, **configuration: Any) -> Experiment:
 def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
     """T p / (1 − p), and exact: each list is the first that arrives with (1 − p) p^k."""
     result = run_experiment(one_car(loss), [scenes.oncoming_car()])
-    late_s = result.table["detection_s"] - 4.0
+    late_s = study_rows(result)["detection_s"] - 4.0
     expected_s = 0.1 * loss / (1 - loss)
     assert late_s.mean() == pytest.approx(expected_s, abs=4 * late_s.std() / math.sqrt(600))
     assert result.exact is not None
@@ -249,7 +249,7 @@ def test_mean_delay_by_loss_and_its_closed_form(loss: float) -> None:
 def test_fused_lists_are_issued_at_ticks() -> None:
     """At 4 Hz the list of 4.0 s, which arrives at 4.03 s, is in the fused list of 4.25 s, and exact times say so."""
     result = run_experiment(one_car(0.0, issue_hz=4, latency_s=0.03), [scenes.oncoming_car()])
-    assert set(result.table["detection_s"]) == {4.25}
+    assert set(study_rows(result)["detection_s"]) == {4.25}
     assert result.exact is not None
     assert result.exact[result.exact["probability"] > 0]["detection_s"].tolist() == [4.25]
     assert result.summary["list_rate_hz"].tolist() == pytest.approx([4.0])

@@ -16,6 +16,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import cut_blocks
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.pipeline.sweep import list_points
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.pipeline.test_chunking import assert_same, both_ways, traffic
 from tests.pipeline.test_closed_form import band, farthest, pairs, refused
@@ -120,7 +121,7 @@ def test_time_to_detection_hardly_depends_on_the_list_rate(rate_hz: float) -> No
         detected = result.exact["detection_s"] <= t + 1e-6
         exact = 1 - result.exact.loc[detected, "probability"].sum()
         assert exact == pytest.approx(expected, abs=1 / (rate_hz * tau_s))
-        sampled = 1 - (result.table["detection_s"] <= t + 1e-6).mean()
+        sampled = 1 - (study_rows(result)["detection_s"] <= t + 1e-6).mean()
         assert sampled == pytest.approx(exact, abs=4.5 * math.sqrt(0.25 / 4000))
 
 
@@ -266,7 +267,7 @@ def test_chunks_have_the_same_bits(of: str, path: str, rows: int) -> None:
         configurations={name: {"units": "all", "latency_s": {"mast": 0.3}, "fusion": f} for name, f in fusions.items()},
     )  # fmt: skip
     whole, pieces = both_ways(setup, [traffic()], rows)
-    assert len(pieces.replays[0].chunks) > 1
+    assert len(pieces.logs[0].replay().chunks) > 1
     assert_same(whole, pieces)
 
 
@@ -285,7 +286,7 @@ def test_blocks_are_smaller_where_detection_lasts(monkeypatch: pytest.MonkeyPatc
 
 def test_more_workers_and_blocks_have_the_same_bits() -> None:
     setup = plan(LASTING["numbers that two units share"][0], runs=9, measure={"onset": {"kind": "appears"}})
-    one, many = (run_experiment(setup, [coming()], jobs=jobs).table for jobs in (1, 4))
+    one, many = (study_rows(run_experiment(setup, [coming()], jobs=jobs)) for jobs in (1, 4))
     pd.testing.assert_frame_equal(one, many, check_exact=True)
     assert one["detection_s"].nunique() > 2
     assert np.isfinite(one["detection_s"]).any()

@@ -24,7 +24,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.receiver import ReceiverOutput, remove_truth_ids
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers.experiments import changed, drive
-from tests.helpers.replays import outputs_of, world_of
+from tests.helpers.replays import outputs_of, study_accuracy, study_rows, world_of
 from tests.helpers.reports import inputs_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 
@@ -76,7 +76,7 @@ def noisy(**changes: Any) -> Experiment:
 
 
 def of(result: StudyTables, configuration: str) -> pd.DataFrame:
-    return result.table[result.table["configuration"] == configuration]
+    return study_rows(result)[study_rows(result)["configuration"] == configuration]
 
 
 def figures(result: StudyTables, configuration: str) -> pd.Series:
@@ -137,12 +137,12 @@ class TestWhatDoesNotMatter:
         one = run_experiment(plan, logs)
         for jobs, size in ((3, 200_000_000), (1, 400 * 3 * 200), (2, 1)):
             monkeypatch.setattr(blocks_module, "BLOCK_BYTES", size)
-            assert len(blocks_module.cut_blocks(one.replays[0], plan, jobs)) > 1
+            assert len(blocks_module.cut_blocks(one.logs[0].replay(), plan, jobs)) > 1
             other = run_experiment(plan, logs, jobs=jobs)
-            pd.testing.assert_frame_equal(one.table, other.table, check_exact=True)
+            pd.testing.assert_frame_equal(study_rows(one), study_rows(other), check_exact=True)
             pd.testing.assert_frame_equal(one.summary, other.summary, check_exact=True)
-            for name, table in one.accuracy.items():
-                assert table.equals(other.accuracy[name]), name
+            for name, table in study_accuracy(one).items():
+                assert table.equals(study_accuracy(other)[name]), name
 
     def test_lists_of_the_same_captures_are_made_once_for_all_latencies(self) -> None:
         names = {"at once": {}, "later": {"latency_s": 0.25}, "latest": {"latency_s": 1 / 3}}

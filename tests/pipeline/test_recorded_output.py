@@ -28,6 +28,7 @@ from copem_replay.pipeline.sweep import list_points
 from copem_replay.results.compare.compare import compare_folders
 from copem_replay.results.read import Results, read_results
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, write_recording
+from tests.helpers.replays import study_accuracy, study_rows
 from tests.io.test_recorded_units import car, list_of
 
 COVARIANCE = [[0.25, 0.0], [0.0, 0.25]]
@@ -68,7 +69,7 @@ def replayed(experiment: Experiment) -> tuple[Recording, StudyTables]:
 
 
 def row(result: StudyTables, configuration: str = "stack") -> pd.Series:
-    return result.table.set_index(["configuration", "object_id"]).loc[(configuration, "2")]
+    return study_rows(result).set_index(["configuration", "object_id"]).loc[(configuration, "2")]
 
 
 def figures(result: StudyTables, configuration: str = "stack") -> pd.Series:
@@ -196,13 +197,13 @@ class TestMeasured:
         _, result = replayed(experiment)
         same_as_union(result, "stack")
         assert figures(result)["false_positives_per_min"] == pytest.approx(3 / (0.6 / 60))  # from 0.35 to 0.95 s
-        assert result.accuracy
+        assert study_accuracy(result)
 
     def test_nothing_is_drawn(self, tmp_path: Path) -> None:
         path = drive(tmp_path / "a.mcap", [list_of(0.5, car(30))], [list_of(0.4, car(30))])
         _, result = replayed(plan(path, runs=7))
         assert figures(result)["interval"] == "nothing drawn"
-        assert result.table.groupby("configuration")["detection_s"].nunique().tolist() == [1, 1]
+        assert study_rows(result).groupby("configuration")["detection_s"].nunique().tolist() == [1, 1]
 
     def test_an_id_named_twice_in_a_list_is_no_track(self) -> None:
         entries = entries_of(5)
@@ -243,14 +244,14 @@ class TestMeasured:
         monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 10)
         recording, pieces = replayed(experiment)
         assert len(prepare_log(recording, experiment).chunks) > 3
-        pd.testing.assert_frame_equal(whole.table, pieces.table)
+        pd.testing.assert_frame_equal(study_rows(whole), study_rows(pieces))
         pd.testing.assert_frame_equal(whole.summary, pieces.summary)
 
 
 def same_as_union(result: StudyTables, name: str) -> None:
     """Rows and figures of a recorded output and of the union of the unit with the same lists."""
     rows = [
-        result.table[result.table["configuration"] == one].drop(
+        study_rows(result)[study_rows(result)["configuration"] == one].drop(
             columns=["configuration", "first_unit", "identity_switches"]
         )
         for one in (name, "union")
@@ -280,7 +281,7 @@ def test_the_list_of_a_real_roadside_unit(trial: str) -> None:
     same_as_union(result, "stack")
     of = figures(result)
     assert of[["output_latency_s", "output_delay_s", "input_age_s"]].tolist() == pytest.approx([0, 0.13, 0.13])
-    times = result.table.pivot(index="object_id", columns="configuration", values="detection_s")
+    times = study_rows(result).pivot(index="object_id", columns="configuration", values="detection_s")
     np.testing.assert_allclose(times["stack"], times["stack:ideal"])
 
 

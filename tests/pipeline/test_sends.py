@@ -21,7 +21,7 @@ from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
-from tests.helpers.replays import world_of
+from tests.helpers.replays import study_accuracy, study_rows, world_of
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, standing
 
 CPM = {"kind": "cpm"}
@@ -160,7 +160,7 @@ def test_the_first_message_that_arrives_detects() -> None:
     lossy = {"reception": {"kind": "constant", "probability": 0.5}, "latency": 0.05}
     configurations = {"coop": {"units": ["mast"], "link": "lossy", "max_age_s": 2.0}}
     some = plan(CPM, links={"lossy": lossy}, configurations=configurations, runs=20)
-    table = run_experiment(some, [car]).table
+    table = study_rows(run_experiment(some, [car]))
     replay = prepare_log(car, some)
     late = 0
     for one in range(20):
@@ -190,11 +190,11 @@ def noisy(sends: object = CPM, **changes: Any) -> tuple[Recording, Experiment]:
 
 
 def assert_same(one: StudyTables, other: StudyTables) -> None:
-    assert one.table.equals(other.table)
+    assert study_rows(one).equals(study_rows(other))
     assert one.summary.equals(other.summary)
-    assert one.accuracy
-    assert other.accuracy
-    assert one.accuracy["lists.parquet"].equals(other.accuracy["lists.parquet"])
+    assert study_accuracy(one)
+    assert study_accuracy(other)
+    assert study_accuracy(one)["lists.parquet"].equals(study_accuracy(other)["lists.parquet"])
 
 
 @pytest.mark.parametrize("sends", [CPM, {"kind": "cpm", "interval_s": 0.2, "max_objects": 2}])
@@ -205,7 +205,7 @@ def test_a_log_in_time_chunks_and_several_workers_give_the_same(monkeypatch: pyt
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
     cut = run_experiment(some, [car])
-    assert len(cut.replays[0].chunks) > 2
+    assert len(cut.logs[0].replay().chunks) > 2
     assert_same(whole, cut)
 
 

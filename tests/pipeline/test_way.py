@@ -18,7 +18,7 @@ from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from copem_replay.report.figures.latency_breakdown import mean_stages
 from tests.helpers import scenes
-from tests.helpers.replays import transmitted, world_of
+from tests.helpers.replays import study_rows, transmitted, world_of
 from tests.helpers.scenes import EGO_UNIT, experiment
 from tests.pipeline import test_recorded_output as recorded_outputs
 from tests.pipeline.test_links import BURSTS, GAMMA, plan, traffic
@@ -35,7 +35,7 @@ def of_oncoming(
         "configurations": {"it": {"units": ["ego"], **configuration}},
     }  # fmt: skip
     some = experiment(**(data | changes))
-    table = run_experiment(some, [scenes.oncoming_car()]).table
+    table = study_rows(run_experiment(some, [scenes.oncoming_car()]))
     return table[list(TIMES)].iloc[0].round(9).tolist(), mean_stages(table, some, "it")
 
 
@@ -74,10 +74,10 @@ def test_of_lists_that_confirm_it_is_the_last() -> None:
 
 
 def test_without_link_ready_or_sends_there_are_no_such_columns() -> None:
-    table = run_experiment(experiment(), [scenes.oncoming_car()]).table
+    table = study_rows(run_experiment(experiment(), [scenes.oncoming_car()]))
     assert not set(WAY) & set(table)
     linked = {"GT": {"units": "truth"}, "PEM": {"units": ["ego"], "link": "v2x"}}
-    beside = run_experiment(experiment(configurations=linked, links={"v2x": {}}), [scenes.oncoming_car()]).table
+    beside = study_rows(run_experiment(experiment(configurations=linked, links={"v2x": {}}), [scenes.oncoming_car()]))
     assert tuple(beside)[-3:] == WAY
     assert beside[list(WAY)].isna().all(axis=1).tolist() == [True, False]
     pd.testing.assert_frame_equal(beside.drop(columns=list(WAY)), table)
@@ -123,7 +123,7 @@ def plainly(some: Experiment, name: str, one: int) -> dict[str, list[float]]:
 
 def test_drawn_times_are_those_of_the_list_that_told() -> None:
     some = drawn(runs=6, measure={"onset": {"kind": "in_range", "range_m": 60}, "accuracy": False})
-    table = run_experiment(some, [traffic()]).table
+    table = study_rows(run_experiment(some, [traffic()]))
     of_ideal = table[table["configuration"] == "coop"]
     for one in range(6):
         rows = of_ideal[of_ideal["run"] == one].set_index("object_id")
@@ -145,7 +145,7 @@ def test_stages_add_up_to_the_time_to_detection() -> None:
         "GT": {"units": "truth", "link": "v2x"}, "wired": {"units": ["ego"]}, "ready": {"units": ["east"]},
     }  # fmt: skip
     some = drawn(units=units, configurations=configurations)
-    table = run_experiment(some, [traffic()]).table
+    table = study_rows(run_experiment(some, [traffic()]))
     for name, rows in table[table["detected"]].groupby("configuration"):
         assert len(rows) > 5, name
         means = mean_stages(rows, some, str(name))
@@ -160,12 +160,12 @@ def test_stages_add_up_to_the_time_to_detection() -> None:
 
 def test_the_same_in_time_chunks_and_by_any_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     some = drawn(units=plan(None).as_written()["units"] | {"east": READY | {"sends": {"kind": "cpm"}}})
-    whole = run_experiment(some, [traffic()]).table
+    whole = study_rows(run_experiment(some, [traffic()]))
     assert whole[list(WAY)].notna().any().all()
-    assert run_experiment(some, [traffic()], jobs=2).table.equals(whole)
+    assert study_rows(run_experiment(some, [traffic()], jobs=2)).equals(whole)
     monkeypatch.setattr(chunking, "ROWS_AT_ONCE", 1)
     monkeypatch.setattr(chunking, "ROWS_A_CHUNK", 200)
-    assert run_experiment(some, [traffic()]).table.equals(whole)
+    assert study_rows(run_experiment(some, [traffic()])).equals(whole)
 
 
 def test_what_is_listed_and_never_arrives() -> None:
@@ -184,7 +184,7 @@ def test_recorded_lists_are_sent_when_they_are_stamped(tmp_path: Path) -> None:
     configurations = recorded_outputs.plan(path).as_written()["configurations"]
     configurations["rsu"] = {"units": ["rsu"], "link": "v2x"}
     some = recorded_outputs.plan(path, configurations=configurations, links={"v2x": {"latency": 0.1}})
-    table = recorded_outputs.replayed(some)[1].table
+    table = study_rows(recorded_outputs.replayed(some)[1])
     rows = table[table["object_id"] == "2"].set_index("configuration")
     assert rows.loc["rsu", list(TIMES)].isna().tolist() == [False, True] + [False] * 5
     times = rows.loc["rsu", [*WAY, "detection_s"]].astype(float).round(9).tolist()

@@ -13,6 +13,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.perception.observation import observe_objects
 from copem_replay.pipeline.run import StudyTables, run_experiment
 from tests.helpers import scenes
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import EGO_UNIT, Thing, experiment, recording, standing
 
 
@@ -21,7 +22,7 @@ def replayed(log: Recording, **changes: Any) -> StudyTables:
 
 
 def row(result: StudyTables, configuration: str, object_id: str = "other", run_number: int = 0) -> pd.Series:
-    table = result.table
+    table = study_rows(result)
     chosen = table[
         (table["configuration"] == configuration) & (table["object_id"] == object_id) & (table["run"] == run_number)
     ]
@@ -207,7 +208,9 @@ def test_short_gaps_are_bridged_and_long_ones_not(gap_s: float, lists_in_gap: in
     truth = interpolate_at_instants(log.truth, log.truth.stamp_ns, t0_ns=log.scene.t0_ns, max_gap_s=0.5)
     walker = truth.captured_s[truth.frame_ix[truth.row_object_ix == 1]]
     assert np.count_nonzero((walker > 1.01) & (walker < 0.99 + gap_s)) == lists_in_gap
-    assert len(replayed(log, measure={"onset": {"kind": "appears"}}).table) == 2, "still one object with one onset"
+    assert len(study_rows(replayed(log, measure={"onset": {"kind": "appears"}}))) == 2, (
+        "still one object with one onset"
+    )
 
 
 def test_a_unit_on_another_car_sees_past_it() -> None:

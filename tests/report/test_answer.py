@@ -203,7 +203,7 @@ class TestEighteen:
         assert set(rows(differences_figure(many).axes[0])) == every - {"GT", "c00"}
 
     def test_those_that_detect_alike_count_once(self, many: Results, tmp_path: Path) -> None:
-        table = many.table.copy()
+        table = many.detections.copy()
         keys = ["log", "object_id", "run"]
         first = table[table["configuration"] == "c00"].set_index(keys)["time_to_detection_s"]
         alike = table["configuration"].isin([f"c{k:02}" for k in range(10)])
@@ -257,7 +257,7 @@ class TestWhichObject:
     def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
         """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
         assert choose_object_and_run(two, Selection()).object_id == "2"
-        table = two.table.assign(conflict=False)
+        table = two.detections.assign(conflict=False)
         run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
         of_run = table[(table["run"] == run) & (table["configuration"] != "GT")]
         late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])

@@ -554,7 +554,7 @@ class TestCurves:
         results = read_results(replayed(tmp_path, text))
         figure = curves_figure(results, configurations=["late"])
         (axes,) = figure.axes
-        rows = results.table[results.table["configuration"] == "late"]
+        rows = results.detections[results.detections["configuration"] == "late"]
         times_s, share = cumulative_incidence(rows["time_to_detection_s"].to_numpy(), np.full(40, DETECTED))
         assert line(axes, "late")[1][1:-1] == pytest.approx(1 - share)
         (drawn,) = (c for c in axes.collections if c.get_label() == "band of late")
@@ -706,7 +706,7 @@ class TestLatencyBreakdown:
         assert [tick.get_text() for tick in axes.get_yticklabels()] == names
         bars = [bar for group in axes.containers if group.get_label() != "_edge" for bar in group.patches]
         for k, name in enumerate(names):
-            rows = results.table[(results.table["configuration"] == name) & results.table["detected"]]
+            rows = results.detections[(results.detections["configuration"] == name) & results.detections["detected"]]
             mine = [bar for bar in bars if bar.get_y() < k < bar.get_y() + bar.get_height()]
             spent_s = rows["detection_s"] - rows["onset_s"]
             assert sum(bar.get_width() for bar in mine) == pytest.approx(spent_s.mean() if len(rows) else 0.0)

@@ -58,7 +58,7 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
             most.append(len(rows))
             yield rows
 
-    monkeypatch.setattr(Results, "table", property(whole))
+    monkeypatch.setattr(Results, "detections", property(whole))
     monkeypatch.setattr(Results, "each", watched)
     assert write_html_report(several, tmp_path / "r.html").exists()
     files, notes = write_figure_files(read_results(several), tmp_path / "figures", Selection())
@@ -72,7 +72,7 @@ def test_neither_holds_all_rows(several: Path, tmp_path: Path, monkeypatch: pyte
 def test_log_by_log_they_are_as_of_all_rows(several: Path) -> None:
     """What goes log by log, against the whole table."""
     results = read_results(several)
-    table = results.table
+    table = results.detections
     names = tuple(results.experiment.configurations)
     of_all = {name: mean_stages(table[table["configuration"] == name], results.experiment, name) for name in names}
     found = mean_stages_by_configuration(results, names)
@@ -103,7 +103,7 @@ def test_those_that_differ_in_one_log_alone(tmp_path: Path) -> None:
     text = eighteen().replace(LOGS, "logs: [drive0.mcap, drive1.mcap]")
     results = read_results(replayed(tmp_path, text, "drive0.mcap", "drive1.mcap"))
     names = tuple(results.experiment.configurations)
-    table = results.table.set_index(["log", "object_id", "run", "configuration"])["time_to_detection_s"]
+    table = results.detections.set_index(["log", "object_id", "run", "configuration"])["time_to_detection_s"]
     times = table.unstack("configuration").round(6)
     alike = {name: next(one for one in names if times[one].equals(times[name])) for name in names}
     assert set(find_differing(results, names)) <= set(alike.values())

@@ -336,12 +336,12 @@ class TestMade:
         replace_ = os.replace
 
         def watched(source: Any, target: Any) -> None:
-            assert Path(target).relative_to("out/e").as_posix() in belongings.read_made_names(folder)
+            assert Path(target).relative_to("out/e").as_posix() in belongings.read_made(folder)
             replace_(source, target)
 
         monkeypatch.setattr(os, "replace", watched)
         assert call(command[0], "out/e", *command[1:]).code == 0
-        assert set(belongings.list_names(folder)) - before <= belongings.read_made_names(folder)
+        assert set(belongings.list_names(folder)) - before <= belongings.read_made(folder).keys()
 
 
 class TestOneWriter:

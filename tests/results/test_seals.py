@@ -22,7 +22,7 @@ from copem_replay.results.provenance import read_provenance
 from copem_replay.results.read import open_results
 from copem_replay.results.seals import check_sealed
 from copem_replay.results.verdicts import write_verdicts
-from tests.helpers.compare_folders import unseal
+from tests.helpers.compare_folders import flip, places, unseal
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
 from tests.system.test_cli import Call, call, run_in
@@ -57,18 +57,6 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(made.parent, tmp_path / "copy")
     monkeypatch.chdir(tmp_path / "copy")
     return Path("out")
-
-
-def flip(path: Path, bit: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(content)
-
-
-def places(path: Path, count: int) -> list[int]:
-    """Bits of a file from its first to its last, and the same number on every run."""
-    last = 8 * path.stat().st_size - 1
-    return sorted({round(last * k / (count - 1)) for k in range(count)})
 
 
 SEALED = (

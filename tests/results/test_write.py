@@ -33,7 +33,7 @@ from copem_replay.results.write import Exporter, RunToExport
 from tests.helpers import scenes
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, write_recording
-from tests.helpers.replays import save_run
+from tests.helpers.replays import save_run, study_rows
 from tests.helpers.scenes import experiment
 
 OF_ACCURACY = {*COMPARED_FILES, "bands.csv"}
@@ -302,7 +302,7 @@ def test_several_runs_of_several_logs(two_logs: list[Path], tmp_path: Path) -> N
     shown = said["runs_shown"]["near/drive"]
     assert [each["file"] for each in shown] == stems
     assert said["run_shown"]["near/drive"] == shown[0]["run"]
-    time_s = result.table[result.table["log"] == "near/drive"].set_index("run")["time_to_detection_s"]
+    time_s = study_rows(result)[study_rows(result)["log"] == "near/drive"].set_index("run")["time_to_detection_s"]
     assert len(set(time_s)) > 1, "else it would not matter which is shown"
     assert (time_s[shown[0]["run"]], time_s[shown[1]["run"]], shown[2]["run"]) == (time_s.max(), time_s.min(), 1)
     names = set()
@@ -343,7 +343,7 @@ def test_blocks_bound_what_is_held_at_once(monkeypatch: pytest.MonkeyPatch) -> N
             patch.setattr(blocks_module, "BLOCK_BYTES", 1)
             assert set(map(len, blocks_module.cut_blocks(ready, many, jobs=1))) == {1}
             for cut_up in (in_sevens, run_experiment(many, [log])):
-                assert cut_up.table.equals(whole.table)
+                assert study_rows(cut_up).equals(study_rows(whole))
                 assert cut_up.summary.equals(whole.summary)
 
 
@@ -380,9 +380,9 @@ def test_a_table_of_many_rows_is_a_folder_that_reads_the_same(tmp_path: Path, mo
     names = ["a.parquet", "two%2Fb %25.parquet"]
     assert sorted(path.name for path in Path("many/detections.parquet").iterdir()) == names
     whole, many = cr.load_results("whole"), cr.load_results("many")
-    pd.testing.assert_frame_equal(whole.table, many.table)
+    pd.testing.assert_frame_equal(whole.detections, many.detections)
     in_any_order = pd.read_parquet("many/detections.parquet").sort_values(["log", "configuration", "run"])
-    assert len(in_any_order) == len(whole.table)
+    assert len(in_any_order) == len(whole.detections)
     first, second = (cr.compare(folder, baseline="PEM").table for folder in (whole, many))
     pd.testing.assert_frame_equal(first, second)
     listed = json.loads(Path("many/provenance.json").read_text())["files"]

@@ -15,6 +15,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 from tests.helpers.scenes import Thing, driving, experiment, recording
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])  # each replays a log
@@ -81,7 +82,7 @@ def test_what_one_unit_detects_its_company_detects_too_and_not_later(
         },
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run_experiment(plan, [log]).table
+    table = study_rows(run_experiment(plan, [log]))
     alone = by_row(table, "PEM")
     for name in ("two", "all"):
         together = by_row(table, name)
@@ -110,7 +111,7 @@ def test_where_nothing_can_be_confused_union_detects_as_ideal_does(
         },
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run_experiment(plan, [recording(things, until_s=3.0)]).table
+    table = study_rows(run_experiment(plan, [recording(things, until_s=3.0)]))
     ideal, union = by_row(table, "ideal"), by_row(table, "union")
     pd.testing.assert_series_equal(ideal["detection_s"], union["detection_s"])
 
@@ -132,7 +133,7 @@ def test_latency_moves_every_detection_by_exactly_itself_or_past_the_end(
         },
         measure={"onset": onset},
     )
-    table = run_experiment(plan, [log]).table
+    table = study_rows(run_experiment(plan, [log]))
     for name in ("now", "GT"):
         now, late = by_row(table, name), by_row(table, "late" + name.removeprefix("now"))
         expected = (now["detection_s"] + latency).where(now["detection_s"] + latency <= now["ended_s"] + 1e-6)
@@ -151,7 +152,7 @@ def test_the_truth_detects_at_the_first_list_from_the_onset_on(log: Recording, o
         configurations={"GT": {"units": "truth"}},
         measure={"onset": onset, "confirm": confirm},
     )
-    table = run_experiment(plan, [log]).table
+    table = study_rows(run_experiment(plan, [log]))
     truth = log.truth
     for found in table.itertuples():
         track = log.scene.object_number[found.object_id]

@@ -32,6 +32,7 @@ from copem_replay.experiment.validate import check_across_logs, find_problems, r
 from copem_replay.extras.maps.registry import read_map
 from copem_replay.io.write.osi import write_osi_trace
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "logs" / "crossing.mcap"
@@ -379,7 +380,7 @@ def table() -> pd.DataFrame:
     result = run_experiment(checked, recordings, jobs=2)
     assert list(result.notes) == []
     assert list(result.summary["configuration"]) == list(checked.configurations)
-    return result.table
+    return study_rows(result)
 
 
 def test_masts_carry_the_roadside_units_and_vehicles_the_others(

@@ -13,6 +13,7 @@ from copem_replay.experiment.validate import find_problems, read_logs
 from copem_replay.io.recording import Recording
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
+from tests.helpers.replays import study_rows
 
 FILE = Path(__file__).parents[2] / "logs/tc016d.yaml"
 ONSET_S = 3.0
@@ -51,7 +52,7 @@ def test_times_follow_the_closed_form() -> None:
     """Independent detection per list: P(T > t) = Π (1 − share). The 500 runs stay within the DKW band at 10⁻⁶."""
     experiment, recording = loaded("flat")
     result = run_experiment(experiment, [recording])
-    table = result.table.set_index("configuration")
+    table = study_rows(result).set_index("configuration")
     missed, exact = 1.0, {}
     for t, share in SHARES.items():
         missed *= 1 - share
@@ -68,7 +69,7 @@ def test_times_follow_the_closed_form() -> None:
 def test_latency_costs_the_way_driven_meanwhile() -> None:
     """The ego drives 10 m/s towards his line: 22.3 m ahead of its centre at the onset, 3 m beside, he steps nearer."""
     experiment, recording = loaded("surface")
-    table = run_experiment(experiment, [recording]).table.set_index("configuration")
+    table = study_rows(run_experiment(experiment, [recording])).set_index("configuration")
     for name, late in (("coPEM:0s", 0.0), ("coPEM:0.5s", 0.5), ("coPEM:1s", 1.0), ("coPEM:1.5s", 1.5)):
         expected = np.hypot(22.3 - 10 * late, 3.0 - late)
         assert table.loc[name, "distance_at_detection_m"].to_numpy() == pytest.approx(expected, abs=1e-6), name

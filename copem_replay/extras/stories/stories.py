@@ -111,7 +111,7 @@ def _story_element(story: ObjectStory, log: str | None) -> Html:
         "div", draw_story(story, hider, said), class_="scroll", tabindex="0", role="region", aria_label=story.name
     )
     helps = tell_what_helps(story.drive.experiment, story.rows)
-    late = why_late(read_why(story.study.results.folder), story.drive.log, story.object_id, story.onset_s)
+    late = why_late(read_why(story.study.results), story.drive.log, story.object_id, story.onset_s)
     named = dict.fromkeys(str(row["configuration"]) for row in (story.first, story.last))
     lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
     causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []

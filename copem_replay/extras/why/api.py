@@ -68,7 +68,7 @@ class Explanation:
         from copem_replay.results.outputs import made_files
 
         place = Path(folder)
-        with made_files(place, list(self.files), place.parent) as scratch:
+        with made_files(place, list(self.files), place.parent, sealed=True) as scratch:
             for name, table in self.files.items():
                 table.to_csv(scratch / name, index=False, lineterminator="\n")
         return [place / name for name in self.files]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from copem_replay.core.errors import InputError, count_noun
+from copem_replay.core.errors import count_noun
 from copem_replay.extras.why.causes import CAUSES, describe_cause
 from copem_replay.extras.why.sensitivity import compare_orders, describe_orders, tabulate_variations
 from copem_replay.extras.why.triage import describe_structure
@@ -25,52 +24,31 @@ from copem_replay.report.html.markup import (
 
 if TYPE_CHECKING:
     from copem_replay.report.html.study import ReportData
+    from copem_replay.results.read import Results
 
 FOLDER: Final = "why"
 """Of a results folder, with the tables of `copem-replay why`."""
-COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
-    "why.csv": ("configuration", "cause", "added_s", "error_s", "gained_s"),
-    "units.csv": ("configuration", "unit", "share_s", "alone_s", "left_out_s"),
-    "triage.csv": (
-        "configuration",
-        "log",
-        "cause",
-        "where",
-        "objects",
-        "lost_s",
-        "structural_share",
-        "example",
-        "example_class",
-    ),
-    "late_episodes.csv": ("configuration", "log", "object_id", "onset_s", "words"),
-    "sensitivity.csv": ("variation", "configuration", "run", "unknown_s"),
-}
+_FILES: Final = ("why.csv", "units.csv", "triage.csv", "late_episodes.csv", "sensitivity.csv")
+_AGAIN: Final = "run `copem-replay why` on the folder again"
 _MOST_GROUPS: Final = 10
 
 
-def read_why(folder: Path | None) -> dict[str, pd.DataFrame]:
+def read_why(results: Results) -> dict[str, pd.DataFrame]:
     """The tables by the names of their files; none without a folder. Raises InputError where one is damaged."""
     tables = {}
-    for name, columns in COLUMNS.items() if folder is not None else ():
-        path = Path(folder or "") / FOLDER / name
-        if not path.is_file():
+    for name in _FILES:
+        if results.folder is None or not (path := results.folder / FOLDER / name).is_file():
             continue
-        try:
-            table = pd.read_csv(path, dtype={"object_id": str, "example": str, "log": str}, keep_default_na=False)
-            for column in columns:
-                if column.endswith(("_s", "_share")):
-                    table[column] = pd.to_numeric(table[column])
-        except (OSError, ValueError, KeyError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); run `copem-replay why` on the folder again") from None
-        if missing := [column for column in columns if column not in table]:
-            raise InputError(f"{path}: expected a column {missing[0]}, found none; run `copem-replay why` again")
-        tables[name] = table
+        results.check_made(f"{FOLDER}/{name}", _AGAIN)
+        table = pd.read_csv(path, dtype={"object_id": str, "example": str, "log": str}, keep_default_na=False)
+        numbers = [column for column in table if column.endswith(("_s", "_share"))]
+        tables[name] = table.assign(**{column: pd.to_numeric(table[column]) for column in numbers})
     return tables
 
 
 def write_section(study: ReportData) -> tuple[str, list[Html]] | None:
     """Title and tables of what `copem-replay why` left in the folder; None: nothing."""
-    tables = read_why(study.results.folder)
+    tables = read_why(study.results)
     return ("Why it is late", [*why_parts(tables)]) if tables else None
 
 
