@@ -161,7 +161,9 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
         files, folder = [folder.absolute()], folder.absolute().parent
         return _open_files(folder, files, opening_s(folder, files), web=web)
     if is_recording(folder):
-        raise InputError(f"{folder}: expected results, found a recording; `copem-replay run {folder}` makes some of it")
+        raise InputError(
+            f"{folder}: expected a results folder, found a recording; `copem-replay run {folder}` makes one"
+        )
     files = list_rrd_files(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")

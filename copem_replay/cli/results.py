@@ -71,6 +71,7 @@ def compare(
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
     from copem_replay.results.decision import decide_compared
     from copem_replay.results.read import open_results
+    from copem_replay.results.screen import choose_notes, format_comparison
 
     if out is not None:
         check_out(out)
@@ -86,7 +87,8 @@ def compare(
         decide=decide,
         matters=dict(map(_parse_matters, matters or ())),
     )
-    notes = list(comparison.notes)
+    whole = bool(explain or by is not None or matters or decide)
+    notes = list(comparison.notes) if whole else choose_notes(comparison.notes)
     if rrd is not None:
         from copem_replay.viewer.side_by_side import write_side_by_side
 
@@ -95,11 +97,9 @@ def compare(
     alone = open_results(folders[0]) if len(folders) == 1 else None
     of = (None, None) if alone is None else (alone.experiment, alone.summary)
     decision = decide_compared(comparison, *of)
-    if explain or by is not None or matters or decide:
+    if whole:
         print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
     else:
-        from copem_replay.results.screen import format_comparison
-
         print_rows(*format_comparison(comparison, decision.best))
         print_line("every figure: --explain")
     if by is not None and len(folders) == 1:

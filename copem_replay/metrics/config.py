@@ -406,8 +406,8 @@ class Needless(Frozen):
     def _tolerant(self) -> Self:
         if self.needed_at > self.brakes_at:
             raise ValueError(
-                f"expected needed_at ≤ brakes_at, found {self.needed_at:g} and {self.brakes_at:g}: the truth is asked "
-                "with tolerance"
+                f"expected needed_at ≤ brakes_at, found {self.needed_at:g} and {self.brakes_at:g}: a true "
+                "object may be a little less in the way than an entry, not more"
             )
         if self.wider_m < self.margin_m:
             raise ValueError(f"expected wider_m ≥ margin_m, found {self.wider_m:g} and {self.margin_m:g}")

@@ -28,6 +28,7 @@ from copem_replay.metrics.limits import (
     describe_absent,
     describe_clusters,
     explain_no_clusters,
+    format_limit,
     format_limits,
     interval_words,
     limit_rate,
@@ -396,7 +397,10 @@ def describe_no_needless(summary: pd.DataFrame) -> str | None:
     if summary[RATE].any():
         return None
     below = limit_rate(np.zeros(1), np.full(1, driving_h))[1]
-    return f"braking for nothing: none in {3600 * driving_h:.3g} s of driving: below {below:.3g} an hour"
+    return (
+        f"braking for nothing: none in {3600 * driving_h:.3g} s of driving, which only rules out more than "
+        f"{format_limit(below)} an hour"
+    )
 
 
 def _needless_lines(summary: pd.DataFrame, width: int | None) -> list[str]:

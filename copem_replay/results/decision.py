@@ -10,7 +10,7 @@ Of one object in one run, what would help the configuration that knows it last: 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,8 @@ _SAME = "same"
 """The word of a pair whose figures are the same throughout, so that there is no interval."""
 _NEAR = "near"
 """The word of a pair whose difference is shown, and shown to be smaller than what matters."""
+_AT_A_PRICE = "at a price"
+"""The word of a pair that is better and brakes for nothing."""
 _NAMED = 4
 """Most configurations that are named with their figures: more make a sentence hard to read."""
 
@@ -52,6 +54,11 @@ class Decision:
 
     sentence: str
     best: tuple[str, ...] = ()
+
+
+def find_brakers(comparison: Comparison) -> set[str]:
+    """Who brakes for nothing for longer than the baseline or, where that does, than another."""
+    return _tell_needless(comparison, None)[0]
 
 
 def decide(results: Results, comparison: Comparison | None = None, verdicts: Judgement | None = None) -> Decision:
@@ -164,15 +171,14 @@ def decide_compared(
     if not len(rows) or comparison.baseline in comparison.truths:
         return Decision(f"There is no answer: nothing can be held against {comparison.baseline}.")
     pairs = {str(row.configuration): _JudgedPair.of(row, scale) for row in rows.itertuples(index=False)}
-    top = max([0.0, *(scale.gain(pair.difference) for pair in pairs.values())])
-    ranked = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
-    best = [name for name, gain in ranked.items() if not scale.matters(top - gain)]
-    if any(name in pairs and pairs[name].word == OPEN for name in best):
-        best.append(comparison.baseline)
-    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
     brakers, sentence = _tell_needless(comparison, summary)
-    best = [name for name in dict.fromkeys(best) if name not in brakers]
-    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale)}.{sentence}", tuple(best))
+    gains = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
+    gains = {name: gain for name, gain in gains.items() if name not in brakers}
+    best = [name for name, gain in gains.items() if not scale.matters(max(gains.values()) - gain)]
+    if comparison.baseline in gains and any(name in pairs and pairs[name].word == OPEN for name in best):
+        best = [*dict.fromkeys([*best, comparison.baseline])]
+    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
+    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale, brakers)}.{sentence}", tuple(best))
 
 
 def _choose_scale(rows: pd.DataFrame) -> _Scale:
@@ -207,22 +213,29 @@ class _JudgedPair:
         return _JudgedPair(float(row.value), float(row.baseline_value), float(row.difference), limits, word)
 
 
-def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
-    """Who is better than the baseline, who is worse, of whom no difference is shown, of whom nothing can be shown."""
+def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale, brakers: Collection[str] = ()) -> str:
+    """Who is better than the baseline, who is worse, of whom no difference is shown, of whom nothing can be shown.
+
+    `brakers`, who brake for nothing, do not stand among the better ones.
+    """
     better, worse = ("Better", "Worse") if scale.is_share else ("Sooner", "Later")
     bases = [pair.base for pair in pairs.values()]
     held = f"{baseline} ({scale.say(bases[0])})" if max(bases) - min(bases) <= NOTHING else baseline
     heads = {
         BETTER: f"{better} than {{}}: ",
+        _AT_A_PRICE: f"{better} than {{}}, but braking for nothing: ",
         WORSE: f"{worse} than {{}}: ",
         _SAME: "The same as {}: ",
         _NEAR: f"Apart from {{}} by less than {scale.least}: ",
         OPEN: "No difference to {} is shown: ",
         "": "No interval, so nothing is shown beyond these very objects, against {}: ",
     }
+    words = {
+        name: _AT_A_PRICE if pair.word == BETTER and name in brakers else pair.word for name, pair in pairs.items()
+    }
     parts: list[str] = []
     for word, head in heads.items():
-        group = {name: pair for name, pair in pairs.items() if pair.word == word}
+        group = {name: pair for name, pair in pairs.items() if words[name] == word}
         if group:
             told = head.format(baseline if parts else held) + _list_pairs(group, scale)
             parts.append(told if not parts else told[:1].lower() + told[1:])

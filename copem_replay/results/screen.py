@@ -7,7 +7,8 @@ same are one, zeros of the truth and columns that nobody has are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +16,10 @@ import pandas as pd
 
 from copem_replay.core.errors import count_noun
 from copem_replay.metrics.braking.driving import SHARE
-from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters, describe_clusters, format_limits
+from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters, describe_clusters, format_limit, format_limits
 from copem_replay.metrics.onset import has_frame_after
 from copem_replay.metrics.summary import describe_no_needless
+from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import NOTHING
 from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE
@@ -61,7 +63,7 @@ _COLUMNS = (
     _Column("known after, s", "95 % by", "ttd_p95_s", _seconds, "never"),
     _Column("at distance, m", "median", "dad_median_m", _metres),
     _Column("", "detected", "detected_share", _per_cent),
-    _Column("braking", "in time", "pass_share", _per_cent),
+    _Column("conflicts", "passed", "pass_share", _per_cent),
     _Column("braking", "for nothing", SHARE, _per_cent),
 )
 
@@ -173,10 +175,16 @@ def _describe_left_out(results: Results) -> str:
 
 _WIDE = 80
 _COMPARED = {
-    "ttd_rmst_s": "known", "pass_share": "brakes in time", SHARE: "brakes for nothing",
+    "ttd_rmst_s": "known", SHARE: "brakes for nothing", "pass_share": "brakes in time",
     "position_rmse_held_m": "position error, m", "false_positives_per_min": "false per minute",
 }  # fmt: skip
-"""Metrics of a comparison that are shown while they fit, and their headers."""
+"""Metrics of a comparison that are shown, the first ones first, and their headers."""
+
+
+def choose_notes(notes: Sequence[str]) -> list[str]:
+    """Notes without those that are about other figures than those of the screen."""
+    named = [{*re.findall(r"\w+", note)} & {*COMPARED} for note in notes]
+    return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*_COMPARED}]
 
 
 def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -191,26 +199,45 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
         for metric in _COMPARED
         if overall.loc[overall["metric"] == metric, "difference"].abs().gt(least.get(metric, NOTHING)).any()
     }
-    kept, width = list[str](), min(_NAMES, max(map(len, names)))
-    for metric, of_metric in cells.items():
-        width += 2 + max(map(len, [_COMPARED[metric], *of_metric]))
-        if width <= _WIDE or not kept:
-            kept.append(metric)
+    first, *others = _pack_columns(names, cells) or [[]]
+    tables = [_tabulate_differences(names, {metric: cells[metric] for metric in first}, best)]
+    tables += [_tabulate_differences(names, {metric: cells[metric] for metric in of}, best) for of in others]
+    shown = tables[: max(1, _MOST_ROWS // max(len(tables[0][0]), 1))]
+    lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
+    starred = any(f" {STAR}" in line for line in lines)
+    return [*_describe_pairs(comparison, starred), *lines], [line for _, marked in shown for line in marked]
+
+
+def _pack_columns(names: Sequence[str], cells: Mapping[str, Sequence[str]]) -> list[list[str]]:
+    """Metrics that stand side by side, in as many tables as it takes."""
+    widths = {metric: 2 + max(map(len, [_COMPARED[metric], *of_metric])) for metric, of_metric in cells.items()}
+    room, packed = _WIDE - min(_NAMES, max(map(len, names))), list[list[str]]()
+    for metric in cells:
+        fits = [of for of in packed if sum(widths[other] for other in [*of, metric]) <= room]
+        if not fits:
+            fits = [list[str]()]
+            packed += fits
+        fits[0].append(metric)
+    return packed
+
+
+def _tabulate_differences(
+    names: Sequence[str], cells: Mapping[str, Sequence[str]], best: Sequence[str]
+) -> tuple[list[str], list[str]]:
+    """The lines of one table, a row for all that differ alike, and those that have one of the `best`."""
     grouped: dict[tuple[str, ...], list[str]] = {}
     for k, name in enumerate(names):
-        grouped.setdefault(tuple(cells[metric][k] for metric in kept), []).append(name)
+        grouped.setdefault(tuple(of_metric[k] for of_metric in cells.values()), []).append(name)
     shown = list(grouped)[:_MOST_ROWS]
-    table = [("", *(_COMPARED[metric] for metric in kept)), *((_join_names(grouped[of]), *of) for of in shown)]
+    table = [("", *(_COMPARED[metric] for metric in cells)), *((_join_names(grouped[of]), *of) for of in shown)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in table]
     marked = [line for line, of in zip(lines[1:], shown, strict=True) if {*grouped[of]} & {*best}]
     left = sum(len(grouped[of]) for of in list(grouped)[_MOST_ROWS:])
-    more = [f"and {left} more: --explain"] if left else []
-    same = ["nothing differs"] if not kept else []
-    return [*_describe_pairs(comparison), *(lines if kept else []), *same, *more], marked
+    return [*lines, *([f"and {left} more: --explain"] if left else [])], marked
 
 
-def _describe_pairs(comparison: Comparison) -> Iterator[str]:
+def _describe_pairs(comparison: Comparison, starred: bool) -> Iterator[str]:
     """What it is held against, and what the intervals are over."""
     limited = comparison.overall.dropna(subset="interval_over")
     limited = limited[limited["metric"] != SHARE]  # which is of drives
@@ -219,9 +246,8 @@ def _describe_pairs(comparison: Comparison) -> Iterator[str]:
     yield f"against {comparison.baseline}{why}; --baseline names another"
     for words in over:
         yield f"[95 %]: over {words}"
-    if (comparison.overall["star"] == STAR).any():
+    if starred:
         yield f"{STAR}: the interval excludes 0, all differences together held at 95 %"
-    yield ""
 
 
 def _tell_difference(metric: str, row: Any) -> str:
@@ -237,6 +263,10 @@ def _tell_difference(metric: str, row: Any) -> str:
         limits = limits if size > 0 else (-row.high, -row.low) if known else limits
     else:
         size, limits = (100 * size, (100 * row.low, 100 * row.high)) if "share" in metric else (size, limits)
-        told = "±0" if abs(size) < NOTHING else f"{size:+.3g}" + (" points" if "share" in metric else "")
+        told = (
+            "±0"
+            if abs(size) < NOTHING
+            else f"{'+' if size > 0 else ''}{format_limit(size)}" + (" points" if "share" in metric else "")
+        )
     marks = [STAR] if row.star == STAR else []
     return " ".join([told, *([format_limits(*limits)] if known and told != "±0" else []), *marks])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,46 @@ def verdict(name: str, word: str) -> Verdict:
         name, "PEM", "", "ttd_rmst_s", None, "at_most", 0.5, 0.95, "these_logs", 0.7, 0.6, 0.8, "jackknife", "logs", 5,
         100, word, word == MET, "",
     )  # fmt: skip
+
+
+class TestBrakingForNothing:
+    """`a` and `b` know sooner than PEM, both shown; who brakes for nothing is not among the better ones."""
+
+    SOONER: tuple[Row, ...] = (("a", 0.5, 1.0, -0.6, -0.4), ("b", 0.7, 1.0, -0.4, -0.2))
+
+    def decided(self, *shares: Row) -> Decision:
+        times, share = compared("ttd_rmst_s", *self.SOONER), compared("needless_brake_share", *shares)
+        return decide_compared(replace(times, table=pd.concat([times.table, share.table], ignore_index=True)))
+
+    def test_who_brakes_for_nothing_is_sooner_at_a_price(self) -> None:
+        assert self.decided(("a", 0.25, 0.0, 0.2, 0.3), ("b", 0.0, 0.0, 0.0, 0.0)) == Decision(
+            "Sooner than PEM (an object is known after 1.00 s on average): b by 0.3 s [0.2, 0.4]; sooner than PEM, but "
+            "braking for nothing: a by 0.5 s [0.4, 0.6]. But with a the driver brakes for nothing in 25 % of the "
+            "driving time (PEM: never).",
+            ("b",),
+        )
+
+    def test_where_the_baseline_does_the_others_are_held_against_the_best_of_them(self) -> None:
+        found = self.decided(("a", 0.0, 0.25, -0.3, -0.2), ("b", 0.25, 0.25, -0.01, 0.01))
+        assert found.best == ("a",)
+        assert found.sentence.startswith("Sooner than PEM (an object is known after 1.00 s on average): a by 0.5 s")
+        assert "; sooner than PEM, but braking for nothing: b by 0.3 s" in found.sentence
+        assert (
+            "But with b the driver brakes for nothing in 25 % of the driving time, with PEM in 25 %" in found.sentence
+        )
+        assert found.sentence.endswith("(a: never).")
+
+    @pytest.mark.parametrize(
+        "share",
+        [
+            pytest.param(("a", 0.004, 0.0, 0.003, 0.005), id="a half per cent is the least that is said"),
+            pytest.param(("a", 0.25, 0.0, -0.1, 0.6), id="the interval includes 0"),
+        ],
+    )
+    def test_what_is_not_shown_or_does_not_matter_is_not_said(self, share: Row) -> None:
+        found = self.decided(share, ("b", 0.0, 0.0, 0.0, 0.0))
+        assert found.best == ("a",)
+        assert "nothing" not in found.sentence
 
 
 def test_criteria_are_the_sentence() -> None:

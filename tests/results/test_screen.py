@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as with_fields
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import copem_replay as cr
 from copem_replay.results.decision import decide
 from copem_replay.results.read import Results
-from copem_replay.results.screen import format_comparison, format_screen
+from copem_replay.results.screen import choose_notes, format_comparison, format_screen
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 PEM = {"p": [{"detection": {"kind": "constant", "probability": 0.6}}]}
@@ -115,15 +116,37 @@ def test_a_comparison_says_sooner_and_later(tmp_path: Path) -> None:
     lines, marked = format_comparison(compared, ["alone"])
     assert lines[0] == "against ideal (by its name); --baseline names another"
     assert lines[1].startswith("[95 %]: over 5 objects of this drive")
-    table = lines[lines.index("") + 1 :]
+    table, rest = "\n".join(lines).partition("\n\n")[2].split("\n\n")[0].split("\n"), lines[lines.index("") + 1 :]
     assert table[0].split()[0] == "known"
     assert [line.split("  ")[0] for line in table[1:]] == ["same", "alone", "late"], "the truth is none"
     assert table[1].split("  ")[1].strip().startswith("as soon")
     row = compared.overall.set_index(["configuration", "metric"]).loc[("late", "ttd_rmst_s")]
     assert f"{row['difference']:.2f} s later" in table[3]
     assert max(map(len, lines[: lines.index("")])) < 200
-    assert max(map(len, table)) <= 80
-    assert marked == [line for line in table if line.startswith("alone")]
+    assert max(map(len, rest)) <= 80
+    assert marked == [line for line in rest if line.startswith("alone")]
+    starred = any(" *" in line for line in rest)
+    assert starred == any(line.startswith("*: ") for line in lines), "what a star is, is said where there is one"
+
+
+def test_figures_that_do_not_fit_side_by_side_stand_below(tmp_path: Path) -> None:
+    compared = cr.compare(replay(tmp_path, 5, configurations={"ideal": {"units": "all"}, "a" * 26: {"units": "all"}}))
+    differ = {"ttd_rmst_s": 0.5, "position_rmse_held_m": 0.125, "false_positives_per_min": 1250.0}
+    table = compared.table.assign(difference=compared.table["metric"].map(differ).fillna(0.0), interval_over="logs")
+    table = table.assign(low=table["difference"] * 0.9, high=table["difference"] * 1.1, star="*")
+    lines, _ = format_comparison(with_fields(compared, table=table), [])
+    assert lines[-5:] == [
+        " " * 28 + "known".ljust(29) + "position error, m",
+        "a" * 26 + "  0.50 s later [0.45, 0.55] *  +0.125 [0.113, 0.138] *",
+        "",
+        " " * 28 + "false per minute",
+        "a" * 26 + "  +1250 [1125, 1375] *",
+    ]
+
+
+def test_notes_on_figures_that_are_not_shown_are_left_out() -> None:
+    kept = ["no interval of ttd_rmst_s, ttd_rmst_s_equal_ghosts: 2 logs", "drive.mcap has 2 logs"]
+    assert choose_notes([*kept, "gnn: no ttd_rmst_s_equal_ghosts: one value"]) == kept
 
 
 def test_a_comparison_with_an_equal_has_no_table(tmp_path: Path) -> None:

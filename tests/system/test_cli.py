@@ -1318,7 +1318,7 @@ class TestView:
             ("file", "file: no such folder"),
             (
                 "drive.mcap",
-                "drive.mcap: expected results, found a recording; `copem-replay run drive.mcap` makes some of it",
+                "drive.mcap: expected a results folder, found a recording; `copem-replay run drive.mcap` makes one",
             ),
         ],
     )

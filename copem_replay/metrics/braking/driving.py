@@ -131,8 +131,9 @@ DRIVING = (
            "the most speed that braking for nothing takes at once, in any run", "needless",
            "most speed lost for nothing, m/s"),
     Metric("must_brake_s", _measure, _if_driving("must_brake_s"), 0,
-           "seconds in which the driver must brake by the truth, all logs", "needless", "must brake, s"),
+           "seconds in which the driver must brake by the truth, all logs", "needless", "must brake by the truth, s"),
     Metric("must_brake_missed_s", _measure, _if_driving("missed_s"), -1,
-           "of these, seconds in which he does not by the lists, mean over runs", "needless", "and does not, s"),
+           "of these, seconds in which he does not by the lists, mean over runs", "needless",
+           "of it missed by the lists, s"),
 )  # fmt: skip
 """Columns of `summary.csv` where a driver is asked when he brakes for nothing."""

@@ -66,13 +66,15 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
     with figure_style():
         figure = new_figure(_WIDE_IN, _HIGH_IN + 0.06 * max(len(names) - 8, 0))
         axes = figure.subplots()
-        for name in names:
-            look = looks[name]
+        places = {name: (sooner_s[name], share[name]) for name in names}
+        for k, name in enumerate(names):
+            look, later = looks[name], [places[other] for other in names[k + 1 :]]
+            size_pt = _MARK_PT * (1 + 0.5 * sum(np.allclose(places[name], place, atol=1e-9) for place in later))
             with mark_configuration(list(looks).index(name), axes):
                 if (line := lines[name]) is not None:
                     axes.plot(sooner_s[name] + line[0], line[1], color=look.colour, linewidth=1, zorder=2)
                 axes.scatter(
-                    [sooner_s[name]], [share[name]], s=_MARK_PT**2, marker=look.marker, facecolor=look.colour,
+                    [sooner_s[name]], [share[name]], s=size_pt**2, marker=look.marker, facecolor=look.colour,
                     zorder=3, label=name, clip_on=False,
                 )  # fmt: skip
         _set_scales(axes, share[names].to_numpy())
@@ -83,8 +85,9 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
             figure,
             [
                 describe_results(results, names),
-                "Better towards the lower right. Intervals of the differences are in the table",
-                "Lines: entries of less and less existence left out" if swept else "",
+                "Better towards the lower right; marks at one place lie within each other",
+                "Intervals: copem-replay compare",
+                "Lines: only entries of more and more existence" if swept else "",
             ],
         )
         figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
+from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.limits import ALL_ALIKE, NOT_ENOUGH, NOTHING_DRAWN
 from copem_replay.report.figures.style import (
     RANKED_BY,
@@ -28,7 +29,7 @@ from copem_replay.report.html.setup import join_names, shorten_list
 from copem_replay.report.html.study import ReportData, detects_at_onset, explain_missing_interval
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.tables import NOTHING, describe_gain
-from copem_replay.results.decision import MATTERS_S, decide
+from copem_replay.results.decision import MATTERS_S, decide, find_brakers
 
 _INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
@@ -64,6 +65,7 @@ def _detail_sentences(study: ReportData) -> Iterator[str]:
     share = rows["detected_share"].astype(float)
     if share[list(contenders)].any():
         yield _soonest_sentence(study)
+        yield from _needless_sentences(study)
         yield from _other_sentences(study)
         yield from _detected_sentences(study, share)
     yield from _pass_sentences(study)
@@ -108,6 +110,15 @@ def _soonest_sentence(study: ReportData) -> Html:
         to = others if undecided == not_tied else f"{undecided} of {others}"
         below = f" The interval of their difference to {to} includes 0."
     return join_html([make_tag("b", join_names(tied)), f" detect {when}.{below}"])
+
+
+def _needless_sentences(study: ReportData) -> Iterator[str]:
+    """With whom of the soonest the driver brakes for nothing."""
+    brakers = set() if study.regret is None else find_brakers(study.regret)
+    for name in study.as_soon:
+        if name in brakers:
+            share = format_per_cent(study.of(name)[SHARE])
+            yield f"With {name} the driver brakes for nothing in {share} % of the driving time."
 
 
 def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
@@ -254,12 +265,12 @@ def _pass_sentences(study: ReportData) -> Iterator[str]:
         return
     judged = rows.loc[[name for name in study.contenders if pd.notna(rows.loc[name, "pass_share"])]]
     if not len(judged):
-        yield "Braking: no object is in conflict with the ego, so there is nothing to judge."
+        yield "Braking in time: no object is in conflict with the ego, so there is nothing to judge."
         return
     share = judged["pass_share"].astype(float)
     best, worst = str(share.idxmax()), str(share.idxmin())
     alike, last = ([str(name) for name in share.index[share == share[one]]] for one in (best, worst))
-    sentence = f"Braking: of {count_noun(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
+    sentence = f"Braking in time: of {count_noun(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
     sentence += f"{_format_share(judged.loc[best])} pass with {shorten_list(alike)}"
     if len(alike) < len(share):
         sentence += f", {_format_share(judged.loc[worst])} with {shorten_list(last)}"
