@@ -403,8 +403,10 @@ def test_from_the_command_line(
     (tmp_path / "e.yaml").write_text(dump_yaml(plan(path).as_written()))
     out = tmp_path / "out"
     said("check", tmp_path / "e.yaml")
-    assert "output_latency_s  output_delay_s  input_age_s" in said("run", tmp_path / "e.yaml", "--out", out)
-    assert "differences to stack:ideal" in said("compare", out, "--rrd", tmp_path / "x.rrd")
+    assert "output_latency_s  output_delay_s  input_age_s" in said(
+        "run", tmp_path / "e.yaml", "--out", out, "--explain"
+    )
+    assert "differences to stack:ideal" in said("compare", out, "--explain", "--rrd", tmp_path / "x.rrd")
     said("report", out)
     page = (out / "report.html").read_text()
     assert "recorded on stack, of rsu" in page

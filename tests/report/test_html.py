@@ -262,7 +262,7 @@ class TestWords:
         assert "The same figures pick the winner, which flatters it a little." in lines
         assert "never never detects any object." in lines
         assert any(
-            line.startswith("Braking: of 6 rows in conflict 100 % [") and "pass with late, half" in line
+            line.startswith("Braking in time: of 6 rows in conflict 100 % [") and "pass with late, half" in line
             for line in lines
         )
         assert "GT is the ground truth: the upper bound, not ranked." in lines
@@ -778,10 +778,11 @@ class TestCommands:
         assert (refused.code, len(refused.lines)) == (2, 1)
         assert not (out / "report.html").exists()
         ended = call("run", experiment, "--out", out, "--report", "--overwrite")
-        assert (ended.code, ended.out[-4:]) == (
+        assert (ended.code, ended.out[-5:]) == (
             0,
             [
                 f"report in {out / 'report.html'}",
+                f"results in {out}; every figure: --explain",
                 f"next: copem-replay report {out}",
                 "",
                 Page((out / "report.html").read_text(encoding="utf-8")).lines()[2],

@@ -403,7 +403,7 @@ class TestOneWriter:
             "note: out/e: other content came there during the run and is kept; the results of this run are in "
             f"{here}/out/e-3"
         ]
-        assert f"results in {here}/out/e-3\n" in ended.out
+        assert f"results in {here}/out/e-3; every figure: --explain\n" in ended.out
 
     def test_without_locks_overwriting_what_another_run_has_just_written(
         self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch

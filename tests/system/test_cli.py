@@ -967,7 +967,7 @@ class TestNamesOfConfigurations:
         assert found.sweep is not None
         assert set(found.sweep["configuration"]) == {"=1+1"}, "at one latency the others are as this one"
         for name in self.NAMES:
-            ended = call("compare", "out/e", f"--baseline={name}")
+            ended = call("compare", "out/e", f"--baseline={name}", "--explain")
             assert ended.code == 0
             assert [line.split()[0] for line in ended.out.splitlines()[1:7]] == [n for n in self.NAMES if n != name]
         assert call("report", "out/e", "--baseline==1+1").code == 0
