@@ -37,7 +37,7 @@ BIN = Path(sys.executable).parent
 MARKS = ("out/study.pieces", "s3://", "--cluster local", "tcp://", "srun", "tls://")
 """What tells the blocks apart. That of s3:// is run by test_object_storage_page.py, the others are run here."""
 IN_A_LINE = ("cr.run(", "pip install ", "python tools/bench.py ", "rm -r ")
-NO_COMMANDS = ("Client.get_executor()", "cr.load_results(", "each(", "interrupted; ", "logs: [")
+NO_COMMANDS = ("--pieces FOLDER", "Client.get_executor()", "cr.load_results(", "each(", "interrupted; ", "logs: [")
 
 
 COMPUTED = "pieces: 6 computed, 0 found in {}/study.pieces"
