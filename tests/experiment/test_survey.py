@@ -120,6 +120,10 @@ def test_survey(path):
                         {"at": [40.0, 0.0], "yaw_deg": 180},
                         {"at": [20.0, 0.0], "yaw_deg": 0},
                     ],
+                    "masts_of_all": [
+                        {"at": [40.0, 0.0], "yaw_deg": 180},
+                        {"at": [20.0, 0.0], "yaw_deg": 0},
+                    ],
                     "began": {
                         "all": {"crossed": 0, "appeared": 0, "log_start": 1},
                         "vru": {"crossed": 0, "appeared": 0, "log_start": 1},

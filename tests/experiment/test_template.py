@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from osi3.osi_sensordata_pb2 import SensorData
 
+import copem_replay as cr
 from copem_replay.cli import main as cli
 from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.draft.findings import Mast
@@ -69,22 +70,24 @@ def replayed(call: Call, tmp_path: Path) -> Callable[[str | Path], dict[str, Any
     return through
 
 
-def street(*, host: int | None = None, seconds: int = 4, far_m: float = 0.0) -> Frames:
-    """Car 1 drives at 10 m/s for the whole time, car 2 for half of it, car 3 stands; pedestrian 7 stands aside."""
+def street(*, walkers: int = 1, seconds: int = 4, far_m: float = 0.0) -> Frames:
+    """Car 1 drives at 10 m/s for the whole time, car 2 for half of it, car 3 stands; pedestrians, 7 and on, stand
+    aside at one place.
+    """
     frames: Frames = []
     for k in range(seconds * 10 + 1):
         t = k / 10
         objects = [
             Obj(id=1, x=10 * t, vx=10),
             Obj(id=3, x=20, y=9),
-            pedestrian(7, 30, 6 + far_m),
+            *(pedestrian(7 + k, 30, 6 + far_m) for k in range(walkers)),
         ]
         frames.append((t, [*objects, *([Obj(id=2, x=40 - 12 * t, y=-4, vx=-12)] if t < seconds / 2 else [])]))
     return frames
 
 
 def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., Any]) -> None:
-    write_recording(tmp_path / "log.mcap", street(), host=2)
+    write_recording(tmp_path / "log.mcap", street(walkers=5), host=2)
     experiment = replayed("log.mcap")
     assert "ego" not in experiment
     assert experiment["logs"] == ["log.mcap"]
@@ -94,6 +97,36 @@ def test_the_host_of_the_log_is_the_ego(tmp_path: Path, replayed: Callable[..., 
     assert "# ego: <id>   # left out: the log names its host vehicle: 2 (car)" in format_draft(
         survey_recording("log.mcap")
     )
+
+
+@pytest.mark.parametrize(("walkers", "widened"), [(1, True), (4, True), (5, False)])
+def test_all_classes_are_measured_where_few_pedestrians_count(
+    tmp_path: Path, replayed: Callable[..., Any], walkers: int, widened: bool
+) -> None:
+    write_recording(tmp_path / "log.mcap", street(walkers=walkers), host=2)
+    measure = replayed("log.mcap")["measure"]
+    text = format_draft(survey_recording("log.mcap"))
+    said = f"# All classes are measured: of pedestrians, bicycles, motorcycles only {walkers} would count."
+    back = "  # objects: {classes: [vru]}   # pedestrians, bicycles, motorcycles alone: "
+    assert (text.splitlines()[1] == said, back in text, "objects" not in measure) == (widened,) * 3
+
+
+def test_the_lines_behind_a_comment_measure_pedestrians_alone(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    """Six cars cross, two pedestrians are there at the start, and count with the second line."""
+    frames: Frames = []
+    for k in range(41):
+        cars = [Obj(id=2 + c, x=60.0 + 8 * c - 2 * k, y=4.0, vx=-20) for c in range(6)]
+        frames.append((k / 10, [Obj(id=1, x=float(k), vx=10), *cars, pedestrian(20, 30, 6), pedestrian(21, 32, 6)]))
+    write_recording(tmp_path / "log.mcap", frames, host=1)
+    assert {"objects", "began"}.isdisjoint(replayed("log.mcap")["measure"])
+    text = format_draft(survey_recording("log.mcap"))
+    alone = text.replace("  # objects: {classes: [vru]}", "  objects: {classes: [vru]}")
+    alone = alone.replace("  # began: [log_start, crossed, appeared]", "  began: [log_start, crossed, appeared]")
+    counted = []
+    for name, asked in (("all.yaml", text), ("alone.yaml", alone)):
+        Path(name).write_text(asked, encoding="utf-8")
+        counted.append(set(cr.run(name).known["object_id"]))
+    assert counted == [{"2", "3", "4", "5", "6", "7"}, {"20", "21"}]
 
 
 @pytest.mark.parametrize(("rate_hz", "line"), [(10.0, None), (2.0, "max_gap_s: 0.8 "), (1.0, "max_gap_s: 1.5 ")])
@@ -243,10 +276,10 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
 
 def test_topics_without_a_name(tmp_path: Path, replayed: Callable[..., Any]) -> None:
     """Of a unit's lists, of one of two truths, of the poses of an ego."""
-    write_recording(tmp_path / "unit.mcap", street(host=1), more=[unit("")])
+    write_recording(tmp_path / "unit.mcap", street(), more=[unit("")])
     recorded = [unit["recorded"]["topic"] for unit in replayed("unit.mcap")["units"].values() if "recorded" in unit]
     assert recorded == [""]
-    write_mcap(tmp_path / "truths.mcap", [truth_topic(street(host=1), name=""), truth_topic(street()[:3], name="b")])
+    write_mcap(tmp_path / "truths.mcap", [truth_topic(street(), name=""), truth_topic(street()[:3], name="b")])
     assert replayed("truths.mcap")["read"]["topic"] == ""
     write_recording(tmp_path / "ego.mcap", street(), more=[poses("")])
     assert replayed("ego.mcap")["ego"]["topic"] == ""
@@ -320,7 +353,7 @@ def test_poses_may_be_the_egos(tmp_path: Path, replayed: Callable[..., Any], cal
     write_mcap(tmp_path / "log.mcap", [scene_update("/objects"), poses("/pose")])
     experiment = replayed("log.mcap")
     assert experiment["ego"] == {"topic": "/pose"}
-    assert experiment["measure"]["objects"] == {"classes": ["vru"]}
+    assert "objects" not in experiment["measure"], "all, for there is one pedestrian"
     text = format_draft(survey_recording("log.mcap"))
     assert "ego:   # the log names no host vehicle; these poses may be the ego's\n  topic: /pose\n  # size_m: " in text
     shown = call("info", "log.mcap").out
@@ -442,8 +475,8 @@ def passing() -> Frames:
 
 
 def test_several_drives_have_each_its_ego_and_mast(tmp_path: Path, replayed_together: Drafts) -> None:
-    write_recording(tmp_path / "host.mcap", street(), host=2)
-    moved = [(t, [Obj(**vars(o) | {"x": o.x + 1000}) for o in objects]) for t, objects in street()]
+    write_recording(tmp_path / "host.mcap", street(walkers=5), host=2)
+    moved = [(t, [Obj(**vars(o) | {"x": o.x + 1000}) for o in objects]) for t, objects in street(walkers=5)]
     write_recording(tmp_path / "guess.mcap", moved)
     draft = replayed_together("host.mcap", "guess.mcap")
     # As the single drafts: the mast 10 m to the north-east of the pedestrian at (30, 6), or 1 km farther east.

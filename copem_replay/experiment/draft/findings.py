@@ -77,8 +77,9 @@ class Suggestion:
     """An experiment to begin with.
 
     `ego`: value of the key, None: the host vehicle of the log. `classes`: measured classes, None: all that moves.
-    `masts`: two, the one with more room around it first. `began`: how many objects cross, appear, or are there at the
-    log's start, within `RANGE_M`, of each group of classes and of all that moves (`all`).
+    `masts`: two where most of them come by, the one with more room around it first; `masts_of_all`: where most of all
+    that moves does. `began`: how many objects cross, appear, or are there at the log's start, within `RANGE_M`, of each
+    group of classes and of all that moves (`all`).
     """
 
     ego: str | dict[str, str] | None
@@ -86,6 +87,7 @@ class Suggestion:
     classes: list[str] | None
     onset: str
     masts: list[Mast]
+    masts_of_all: list[Mast]
     began: dict[str, dict[str, int]]
 
 
@@ -167,7 +169,7 @@ def survey_as_json(survey: RecordingSurvey) -> dict[str, Any]:
 RANGE_M = 40.0
 """Distance to the ego within which objects are measured, the same in all drafts, so that drives stay comparable."""
 FEWEST_COUNTED = 5
-"""With fewer objects that cross or appear, those of the log's start count, too."""
+"""With fewer objects that cross or appear, those of the log's start count, too; with fewer still, all classes."""
 MAST_M = 10.0
 """Distance of the mast from the busiest place: beside the lane, not on it."""
 _CELL_M = 10.0
@@ -192,11 +194,16 @@ def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = N
     if not len(rows):
         rows = np.arange(len(objects))
     masts = _suggest_masts(truth, rows, objects)
+    everyone = np.flatnonzero(scene.moving[objects] & (objects != number) & _is_near_ego(truth, objects, number))
+    masts_of_all = _suggest_masts(truth, everyone, objects) if classes and len(everyone) else masts
     groups = {"all": scene.moving} | {
         name: np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")
     }
-    began = {name: _count_began(truth, number, measured, masts[0]) for name, measured in groups.items()}
-    return Suggestion(ego, why, classes, onset, masts, began)
+    began = {
+        name: _count_began(truth, number, measured, (masts_of_all if name == "all" else masts)[0])
+        for name, measured in groups.items()
+    }
+    return Suggestion(ego, why, classes, onset, masts, masts_of_all, began)
 
 
 def _count_began(truth: Tracks, ego_ix: int, measured: Bool, mast: Mast) -> dict[str, int]:

@@ -31,6 +31,7 @@ _UNIT = "[[0.5, 0.0], [0.0, 0.5]]"
 _GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", "list", "markers", "data", "msg"}
 _FUSED = {"fusion", "fused", "stack"}
 """Words in the topic of a stack's own output."""
+_KINDS = {"vru": "pedestrians, bicycles, motorcycles", "vehicles": "cars, trucks, …"}
 _OTHERS = 6  # topics listed in comments, at most: a line each
 
 
@@ -57,11 +58,12 @@ class _Drive:
 def format_draft(*surveys: RecordingSurvey) -> str:
     """The experiment on one log or several, each surveyed, with a comment on each key; it runs unchanged."""
     drives = [_Drive(survey, max(survey.truth, key=lambda truth: truth.states)) for survey in surveys]
+    drives, few = _widen_classes(drives)
     recorded, outputs = _name_recorded(drives)
     ego = any(drive.has_ego for drive in drives)
     first = ["ego", "roadside"] if ego else ["roadside", "across"]
     lines = [
-        *_draft_head(drives),
+        *_draft_head(drives, few),
         "version: 1",
         *(_draft_only_log(drives[0]) if len(drives) == 1 else _draft_logs(drives, first, recorded)),
         "runs: 20   # each with its own draws, the same in all configurations; more say nothing of other drives",
@@ -82,7 +84,7 @@ def format_draft(*surveys: RecordingSurvey) -> str:
         *_draft_configurations(first, [name for name, _ in recorded], ego=ego),
         *_draft_outputs(outputs, [name for name, _ in recorded]),
         "",
-        *_draft_measure(_merge_measured(drives), ego=ego),
+        *_draft_measure(_merge_measured(drives), few, ego=ego),
         *_draft_braking(drives, ego=ego),
         *_draft_gap(drives),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
@@ -90,10 +92,50 @@ def format_draft(*surveys: RecordingSurvey) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _draft_head(drives: Sequence[_Drive]) -> Iterator[str]:
+@dataclass(frozen=True)
+class _Few:
+    """Classes of which too few count, so that all are measured."""
+
+    classes: list[str]
+    counted: int
+
+    @property
+    def said(self) -> str:
+        return " and ".join(_KINDS[name] for name in self.classes)
+
+
+def _widen_classes(drives: list[_Drive]) -> tuple[list[_Drive], _Few | None]:
+    """The drives, with all classes where fewer than `FEWEST_COUNTED` of their own would count in all logs together."""
+    merged = _merge_measured(drives)
+    counted, of_all = _sum_began(merged).total(), sum(merged.began["all"].values())
+    if merged.classes is None or merged.onset == "appears" or counted >= FEWEST_COUNTED or of_all <= counted:
+        return drives, None
+    wide = [replace(drive.guess, classes=None, masts=drive.guess.masts_of_all) for drive in drives]
+    widened = [replace(drive, truth=replace(drive.truth, suggested=of)) for drive, of in zip(drives, wide, strict=True)]
+    return widened, _Few(merged.classes, counted)
+
+
+def _sum_began(guess: Suggestion) -> Counter[str]:
+    """How many of the measured classes begin how."""
+    began = Counter[str]()
+    for name in guess.classes or ["all"]:
+        began.update(guess.began[name])
+    return began
+
+
+def _counts_all(guess: Suggestion) -> bool:
+    """Whether objects of the log's start count, too, for there are few others."""
+    began = _sum_began(guess)
+    return began["crossed"] + began["appeared"] < FEWEST_COUNTED
+
+
+def _draft_head(drives: Sequence[_Drive], few: _Few | None) -> Iterator[str]:
     of = _format_comment(drives[0].survey.recording) if len(drives) == 1 else f"{len(drives)} drives"
     span_s = sum(drive.truth.span_s for drive in drives)
     yield f"# Replays {of}, {span_s:.1f} s: {_describe_objects([drive.truth for drive in drives])}."
+    if few is not None:
+        yield f"# All classes are measured: of {few.said} only {few.counted} would count."
+        yield "# What stands behind `#` below `measure:` measures them alone."
     yield "# Written by `copem-replay init`, as a starting point. A key behind a `#` can be used as it stands, without"
     yield "# the `#` (<id> stands for an object's)."
     yield "#"
@@ -345,11 +387,15 @@ def _draft_outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[
         yield f"  {name}: {{recorded: {_format_recorded(unit)}, inputs: [{', '.join(recorded)}]}}{late}"
 
 
-def _draft_measure(guess: Suggestion, *, ego: bool) -> Iterator[str]:
-    kinds = {"vru": "pedestrians, bicycles, motorcycles", "vehicles": "cars, trucks, …"}
+def _draft_measure(guess: Suggestion, few: _Few | None, *, ego: bool) -> Iterator[str]:
     yield "measure:"
-    if guess.classes:
-        text = ", ".join(kinds[name] for name in guess.classes)
+    if few is not None:
+        alone = count_noun(few.counted, "object")
+        yield f"  # objects: {{classes: {dump_on_one_line(few.classes)}}}   # {few.said} alone: {alone}"
+        if not _counts_all(guess):
+            yield "  # began: [log_start, crossed, appeared]   # with them"
+    elif guess.classes:
+        text = ", ".join(_KINDS[name] for name in guess.classes)
         yield f"  objects: {{classes: {dump_on_one_line(guess.classes)}}}   # {text}; or {{ids: [1, 2]}}; left out: all"
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
@@ -397,11 +443,9 @@ def _draft_began(guess: Suggestion) -> str:
     """The line of `began`: its default as a comment, or all three words, with the reason."""
     if guess.onset == "appears":
         return "  began: [log_start, crossed, appeared]   # who counts: all, for nobody crosses into view"
-    began = Counter[str]()
-    for name in guess.classes or ["all"]:
-        began.update(guess.began[name])
+    began = _sum_began(guess)
     numbers = ", ".join(f"{number} {word}" for word, number in began.items())
-    if began["crossed"] + began["appeared"] < FEWEST_COUNTED:
+    if _counts_all(guess):
         return f"  began: [log_start, crossed, appeared]   # who counts: all, for there are only {numbers}"
     return f"  # began: [crossed, appeared]   # who counts; left out: these ({numbers})"
 
