@@ -205,7 +205,10 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
     shown = tables[: max(1, _MOST_ROWS // max(len(tables[0][0]), 1))]
     lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
     starred = any(f" {STAR}" in line for line in lines)
-    return [*_describe_pairs(comparison, starred), *lines], [line for _, marked in shown for line in marked]
+    told = [metric for metric in _COMPARED if metric in cells and metric != SHARE]  # which is of drives
+    return [*_describe_pairs(comparison, told or ["ttd_rmst_s"], starred), *lines], [
+        line for _, marked in shown for line in marked
+    ]
 
 
 def _pack_columns(names: Sequence[str], cells: Mapping[str, Sequence[str]]) -> list[list[str]]:
@@ -237,15 +240,20 @@ def _tabulate_differences(
     return [*lines, *([f"and {left} more: --explain"] if left else [])], marked
 
 
-def _describe_pairs(comparison: Comparison, starred: bool) -> Iterator[str]:
+def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: bool) -> Iterator[str]:
     """What it is held against, and what the intervals are over."""
-    limited = comparison.overall.dropna(subset="interval_over")
-    limited = limited[limited["metric"] != SHARE]  # which is of drives
-    over = [describe_clusters(str(kind), int(of["clusters"].max())) for kind, of in limited.groupby("interval_over")]
+    limited, over = comparison.overall.dropna(subset=["interval_over", "clusters"]), dict[str, list[str]]()
+    for metric in metrics:
+        for kind, of in limited[limited["metric"] == metric].groupby("interval_over"):
+            counts = of["clusters"].astype(int)
+            over.setdefault(describe_clusters(str(kind), counts.max(), counts.min()), []).append(
+                _COMPARED[metric].partition(", ")[0]
+            )
     why = "" if comparison.baseline_why is None else f" ({comparison.baseline_why})"
     yield f"against {comparison.baseline}{why}; --baseline names another"
-    for words in over:
-        yield f"[95 %]: over {words}"
+    for k, (words, headers) in enumerate(over.items()):
+        of_what = f" of {' and '.join(headers)}" if len(over) > 1 else ""
+        yield f"[95 %]{of_what}: over {words if k == 0 else words.partition(': ')[0]}"
     if starred:
         yield f"{STAR}: the interval excludes 0, all differences together held at 95 %"
 

@@ -144,6 +144,20 @@ def test_figures_that_do_not_fit_side_by_side_stand_below(tmp_path: Path) -> Non
     ]
 
 
+def test_what_the_intervals_of_each_figure_are_over(tmp_path: Path) -> None:
+    """Accuracy is of all objects, times of those that count."""
+    compared = cr.compare(replay(tmp_path, 5, configurations={"ideal": {"units": "all"}, "b": {"units": "all"}}))
+    clusters = {"ttd_rmst_s": 6, "position_rmse_held_m": 9, "false_positives_per_min": 9}
+    table = compared.table[compared.table["metric"].isin(list(clusters))]
+    table = table.assign(difference=0.5, low=0.25, high=0.75, star="", interval_over="objects")
+    told = with_fields(compared, table=table.assign(clusters=table["metric"].map(clusters)))
+    assert format_comparison(told, [])[0][1:3] == [
+        "[95 %] of known: over 6 objects of this drive: how far other objects of this drive may differ; nothing about "
+        "other drives",
+        "[95 %] of position error and false per minute: over 9 objects of this drive",
+    ]
+
+
 def test_notes_on_figures_that_are_not_shown_are_left_out() -> None:
     kept = ["no interval of ttd_rmst_s, ttd_rmst_s_equal_ghosts: 2 logs", "drive.mcap has 2 logs"]
     assert choose_notes([*kept, "gnn: no ttd_rmst_s_equal_ghosts: one value"]) == kept
