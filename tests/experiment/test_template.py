@@ -107,7 +107,7 @@ def test_all_classes_are_measured_where_few_pedestrians_count(
     measure = replayed("log.mcap")["measure"]
     text = format_draft(survey_recording("log.mcap"))
     said = f"# All classes are measured: of pedestrians, bicycles, motorcycles only {walkers} would count."
-    back = "  # objects: {classes: [vru]}   # pedestrians, bicycles, motorcycles alone: "
+    back = "  # objects: {classes: [vru]}   # pedestrians, bicycles, motorcycles alone"
     assert (text.splitlines()[1] == said, back in text, "objects" not in measure) == (widened,) * 3
 
 

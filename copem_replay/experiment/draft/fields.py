@@ -33,18 +33,8 @@ _NO_PLACE = re.compile(
     r"|prev|predict|path|future|goal|footprint|polygon|corner|vertex|vertices"
 )
 _IDS = (
-    "id",
-    "track_id",
-    "object_id",
-    "tracking_id",
-    "obj_id",
-    "objectid",
-    "trackid",
-    "uuid",
-    "uid",
-    "identifier",
-    "track",
-)
+    "id", "track_id", "object_id", "tracking_id", "obj_id", "objectid", "trackid", "uuid", "uid", "identifier", "track",
+)  # fmt: skip
 _INNER_IDS = ("uuid", "value", "id")
 _CLASSES = (
     "class", "class_name", "classname", "class_id", "category", "category_name", "classification", "label",
@@ -52,11 +42,7 @@ _CLASSES = (
 )  # fmt: skip
 _STAMPS = ("header.stamp", "header.timestamp", "timestamp", "stamp", "header.time", "time", "t", "measurement_time")
 _FRAMES = ("header.frame_id", "frame_id", "header.frame", "frame")
-_FLAT = {
-    "x_m": ("x_m", "y_m", "z_m"),
-    "easting": ("easting", "northing", "altitude"),
-    "utm_x": ("utm_x", "utm_y"),
-}
+_FLAT = {"x_m": ("x_m", "y_m", "z_m"), "easting": ("easting", "northing", "altitude"), "utm_x": ("utm_x", "utm_y")}
 _DAY_NS = 86_400 * 10**9
 
 

@@ -196,13 +196,10 @@ def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = N
     masts = _suggest_masts(truth, rows, objects)
     everyone = np.flatnonzero(scene.moving[objects] & (objects != number) & _is_near_ego(truth, objects, number))
     masts_of_all = _suggest_masts(truth, everyone, objects) if classes and len(everyone) else masts
-    groups = {"all": scene.moving} | {
-        name: np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")
+    groups = {"all": (scene.moving, masts_of_all[0])} | {
+        name: (np.isin(scene.object_class, class_indices((name,))), masts[0]) for name in ("vru", "vehicles")
     }
-    began = {
-        name: _count_began(truth, number, measured, (masts_of_all if name == "all" else masts)[0])
-        for name, measured in groups.items()
-    }
+    began = {name: _count_began(truth, number, *group) for name, group in groups.items()}
     return Suggestion(ego, why, classes, onset, masts, masts_of_all, began)
 
 

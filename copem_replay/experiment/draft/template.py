@@ -92,27 +92,19 @@ def format_draft(*surveys: RecordingSurvey) -> str:
     return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True)
-class _Few:
-    """Classes of which too few count, so that all are measured."""
-
-    classes: list[str]
-    counted: int
-
-    @property
-    def said(self) -> str:
-        return " and ".join(_KINDS[name] for name in self.classes)
-
-
-def _widen_classes(drives: list[_Drive]) -> tuple[list[_Drive], _Few | None]:
-    """The drives, with all classes where fewer than `FEWEST_COUNTED` of their own would count in all logs together."""
+def _widen_classes(drives: list[_Drive]) -> tuple[list[_Drive], tuple[str, str] | None]:
+    """The drives, with all classes where too few of their own would count; then who these are, and their key."""
     merged = _merge_measured(drives)
     counted, of_all = _sum_began(merged).total(), sum(merged.began["all"].values())
     if merged.classes is None or merged.onset == "appears" or counted >= FEWEST_COUNTED or of_all <= counted:
         return drives, None
     wide = [replace(drive.guess, classes=None, masts=drive.guess.masts_of_all) for drive in drives]
     widened = [replace(drive, truth=replace(drive.truth, suggested=of)) for drive, of in zip(drives, wide, strict=True)]
-    return widened, _Few(merged.classes, counted)
+    said = " and ".join(_KINDS[name] for name in merged.classes)
+    return widened, (
+        f"{said} only {counted}",
+        f"objects: {{classes: {dump_on_one_line(merged.classes)}}}   # {said} alone",
+    )
 
 
 def _sum_began(guess: Suggestion) -> Counter[str]:
@@ -129,12 +121,12 @@ def _counts_all(guess: Suggestion) -> bool:
     return began["crossed"] + began["appeared"] < FEWEST_COUNTED
 
 
-def _draft_head(drives: Sequence[_Drive], few: _Few | None) -> Iterator[str]:
+def _draft_head(drives: Sequence[_Drive], few: tuple[str, str] | None) -> Iterator[str]:
     of = _format_comment(drives[0].survey.recording) if len(drives) == 1 else f"{len(drives)} drives"
     span_s = sum(drive.truth.span_s for drive in drives)
     yield f"# Replays {of}, {span_s:.1f} s: {_describe_objects([drive.truth for drive in drives])}."
     if few is not None:
-        yield f"# All classes are measured: of {few.said} only {few.counted} would count."
+        yield f"# All classes are measured: of {few[0]} would count."
         yield "# What stands behind `#` below `measure:` measures them alone."
     yield "# Written by `copem-replay init`, as a starting point. A key behind a `#` can be used as it stands, without"
     yield "# the `#` (<id> stands for an object's)."
@@ -387,11 +379,10 @@ def _draft_outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[
         yield f"  {name}: {{recorded: {_format_recorded(unit)}, inputs: [{', '.join(recorded)}]}}{late}"
 
 
-def _draft_measure(guess: Suggestion, few: _Few | None, *, ego: bool) -> Iterator[str]:
+def _draft_measure(guess: Suggestion, few: tuple[str, str] | None, *, ego: bool) -> Iterator[str]:
     yield "measure:"
     if few is not None:
-        alone = count_noun(few.counted, "object")
-        yield f"  # objects: {{classes: {dump_on_one_line(few.classes)}}}   # {few.said} alone: {alone}"
+        yield f"  # {few[1]}"
         if not _counts_all(guess):
             yield "  # began: [log_start, crossed, appeared]   # with them"
     elif guess.classes:
