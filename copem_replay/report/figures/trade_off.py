@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 _WIDE_IN, _HIGH_IN = 8.0, 4.0
 _MARK_PT = 7.0
+_NEAR_S, _NEAR_SHARE = 0.02, 0.05
+"""Seconds, and part of the share, by which marks differ that cover each other: a fraction of a mark."""
 _MOST_ROWS = 200_000
 """Of more rows no lines are drawn: they would take longer than all other figures."""
 _KEYS = ["run", "object_id", "episode"]
@@ -69,7 +71,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
         places = {name: (sooner_s[name], share[name]) for name in names}
         for k, name in enumerate(names):
             look, later = looks[name], [places[other] for other in names[k + 1 :]]
-            size_pt = _MARK_PT * (1 + 0.5 * sum(np.allclose(places[name], place, atol=1e-9) for place in later))
+            size_pt = _MARK_PT * (1 + 0.5 * sum(_cover(places[name], place) for place in later))
             with mark_configuration(list(looks).index(name), axes):
                 if (line := lines[name]) is not None:
                     axes.plot(sooner_s[name] + line[0], line[1], color=look.colour, linewidth=1, zorder=2)
@@ -92,6 +94,11 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
         )
         figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")
     return figure
+
+
+def _cover(first: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two marks lie so near to each other that the first would not be seen."""
+    return abs(first[0] - other[0]) < _NEAR_S and bool(np.isclose(first[1], other[1], rtol=_NEAR_SHARE, atol=0.0))
 
 
 def _set_scales(axes: Axes, share: Float) -> None:
