@@ -199,10 +199,9 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
         for metric in _COMPARED
         if overall.loc[overall["metric"] == metric, "difference"].abs().gt(least.get(metric, NOTHING)).any()
     }
-    first, *others = _pack_columns(names, cells) or [[]]
-    tables = [_tabulate_differences(names, {metric: cells[metric] for metric in first}, best)]
-    tables += [_tabulate_differences(names, {metric: cells[metric] for metric in of}, best) for of in others]
-    shown = tables[: max(1, _MOST_ROWS // max(len(tables[0][0]), 1))]
+    packed = _pack_columns(names, cells)
+    tables = [_tabulate_differences(names, {metric: cells[metric] for metric in of}, best) for of in packed]
+    shown = tables[: max(1, _MOST_ROWS // len(tables[0][0]))] if tables else []
     lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
     starred = any(f" {STAR}" in line for line in lines)
     told = [metric for metric in _COMPARED if metric in cells and metric != SHARE]  # which is of drives

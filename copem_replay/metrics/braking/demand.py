@@ -31,7 +31,7 @@ from copem_replay.core.compiled import borrowing, borrowing_kernel
 from copem_replay.core.geometry import box_distance, pose_on_path
 from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.braking.driver import Driver, driver_deceleration, reaction_delays
-from copem_replay.metrics.braking.encounter import EgoPath
+from copem_replay.metrics.braking.encounter import Course, EgoPath
 
 STEP_S = 0.05
 """Seconds between places that are compared: two vehicles that cross at 30 m/s come 1.5 m nearer."""
@@ -58,7 +58,9 @@ class BrakingEgo:
 
     def is_driving(self, time_s: Float) -> Bool:
         """(K,) whether the ego is in the log, and not too slow."""
-        course = self.path.course(time_s)
+        return self._is_driving(self.path.course(time_s))
+
+    def _is_driving(self, course: Course) -> Bool:
         driving: Bool = ~np.isnan(course.along_m) & (course.speed_mps >= self.slower_mps)
         return driving
 
@@ -70,7 +72,7 @@ class BrakingEgo:
         """
         out = np.zeros(len(which), dtype=np.bool_)
         course = self.path.course(time_s)
-        driving = np.flatnonzero(~np.isnan(course.along_m) & (course.speed_mps >= self.slower_mps))
+        driving = np.flatnonzero(self._is_driving(course))
         row_of = np.full(len(time_s), -1)
         for begin in range(0, len(driving), _LISTS):
             block = driving[begin : begin + _LISTS]
