@@ -69,6 +69,7 @@ def compare(
     """
     from copem_replay.api.results import compare as compare_results
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
+    from copem_replay.results.decision import decide as decide_on
     from copem_replay.results.decision import decide_compared
     from copem_replay.results.read import open_results
     from copem_replay.results.screen import choose_notes, format_comparison
@@ -95,8 +96,7 @@ def compare(
         notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
     print_notes(notes)
     alone = open_results(folders[0]) if len(folders) == 1 else None
-    of = (None, None) if alone is None else (alone.experiment, alone.summary)
-    decision = decide_compared(comparison, *of)
+    decision = decide_compared(comparison) if alone is None else decide_on(alone, comparison)
     if whole:
         print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
     else:
@@ -113,7 +113,7 @@ def compare(
         write_comparison(comparison, out, folders)
     _print_written(out, rrd)
     code = _judge_differences(conditions, folders)
-    print_answer(decision.sentence)
+    print_answer(decision.sentences)
     return code
 
 

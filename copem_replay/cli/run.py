@@ -128,7 +128,7 @@ def run(
     drafted = "" if source.path in experiment else f", drafted as by init ({EXPERIMENT})"
     print_line(f"results in {place.shown}{drafted}{'' if explain else '; every figure: --explain'}")
     _print_next(place.shown)
-    print_answer(decision.sentence if verdicts is None else describe_verdicts(verdicts))
+    print_answer(decision.sentences if verdicts is None else [describe_verdicts(verdicts)])
     return 1 if study.skipped or place.failed or not (verdicts is None or verdicts.passes) else 0
 
 

@@ -130,9 +130,9 @@ def print_rows(lines: Iterable[str], bold: Collection[str] = ()) -> None:
         print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line in bold else fitted)
 
 
-def print_answer(sentence: str) -> None:
-    """Print the answer, the last paragraph of a command."""
-    print_blocks([["", sentence]])
+def print_answer(sentences: Sequence[str]) -> None:
+    """Print the answer, the last paragraph of a command, each sentence on lines of its own."""
+    print_blocks([["", *sentences]])
 
 
 def print_problems(lines: Iterable[str]) -> None:

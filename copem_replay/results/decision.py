@@ -1,16 +1,17 @@
-"""Decision: what results say, in one sentence for those who decide; the report begins with it, the terminal ends so.
+"""Decision: what results say, in a few sentences for those who decide; the report begins with it, the terminal ends so.
 
-With criteria the sentence is their verdicts. Else it is by the share of conflicts that pass, where it differs, else by
-the mean time to detection: who is better than the baseline, who is worse, of whom no difference is shown, each by the
-95 % interval of the difference over the rows of its own pair. Without an interval nothing is claimed. Whoever brakes
-for nothing for longer than the baseline is named after that, and is never among the best.
-
-Of one object in one run, what would help the configuration that knows it last: a key of another one, or its units.
+With criteria it is their verdicts. Else it is by the share of conflicts that pass, where it differs, else by the mean
+time to detection, in parts (`_tell_parts`): what cooperation brings against the car alone, what fusion costs against
+the ideal of the same lists, what latency costs. Without a car alone, or where a baseline is named, each configuration
+is held against the baseline. Each pair is judged by the 95 % interval of its own difference, over its own rows; without
+an interval nothing is claimed. Whoever brakes for nothing for longer than the baseline is named after that, and is
+never among the best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -19,11 +20,11 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.schema import Configuration, Experiment
 from copem_replay.metrics.braking.driving import SHARE
-from copem_replay.metrics.limits import format_limit, format_limits
+from copem_replay.metrics.limits import ALL_ALIKE, CLUSTERS, format_limit, format_limits
 from copem_replay.results.compare import Comparison, compare_folders
+from copem_replay.results.compare.labels import find_alone
 from copem_replay.results.compare.limits import BETTER, OPEN, WORSE
 from copem_replay.results.compare.tables import NOTHING
 from copem_replay.results.verdicts import NOT_MET, Judgement
@@ -41,19 +42,27 @@ DECIDED_BY = ("ttd_rmst_s", "pass_share")
 _SAME = "same"
 """The word of a pair whose figures are the same throughout, so that there is no interval."""
 _NEAR = "near"
-"""The word of a pair whose difference is shown, and shown to be smaller than what matters."""
+"""The word of a pair whose difference is shown to be smaller than what matters."""
+_ALIKE = "alike"
+"""The word of a pair whose difference is the same in all rows, so that there is no interval."""
 _AT_A_PRICE = "at a price"
 """The word of a pair that is better and brakes for nothing."""
 _NAMED = 4
 """Most configurations that are named with their figures: more make a sentence hard to read."""
+_IDEAL = "the ideal of the same lists"
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One sentence, and the configurations with the best figure; several, if their difference does not matter."""
+    """`sentences`: one a part; `best`: the configurations with the best figure, several if no difference matters."""
 
-    sentence: str
+    sentences: tuple[str, ...]
     best: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """All of it."""
+        return " ".join(self.sentences)
 
 
 def find_brakers(comparison: Comparison) -> set[str]:
@@ -67,19 +76,21 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
     `verdicts`: of criteria, which are the sentence where there are any.
     """
     if not len(results.known):
-        return Decision("There is no answer: no measured object has an onset.")
+        return Decision(("There is no answer: no measured object has an onset.",))
     names = [name for name, facts in results.facts.items() if not facts.truth] or list(results.facts)
     share = results.summary.set_index("configuration")["detected_share"]
     if not share[names].any():
         others = "" if len(names) == len(results.facts) else " (only the ground truth has them)"
-        found = Decision(f"No configuration detects any measured object in any run{others}.")
+        found = Decision((f"No configuration detects any measured object in any run{others}.",))
     elif len(names) == 1:
-        found = _describe_alone(results, names[0])
+        found = _describe_single(results, names[0])
     else:
         driven = (SHARE,) if SHARE in results.summary else ()
         comparison = comparison or compare_folders([results], metrics=(*DECIDED_BY, *driven))
-        found = decide_compared(comparison, results.experiment, results.summary)
-    return found if verdicts is None else Decision(describe_verdicts(verdicts), found.best)
+        compared = [name for name in names if name in (comparison.baseline, *comparison.configurations)]
+        parts = () if comparison.baseline_why is None else tuple(_tell_parts(results, comparison, compared))
+        found = decide_compared(comparison, results.experiment, results.summary, parts)
+    return found if verdicts is None else Decision((describe_verdicts(verdicts),), found.best)
 
 
 def describe_verdicts(verdicts: Judgement) -> str:
@@ -97,10 +108,10 @@ def describe_verdicts(verdicts: Judgement) -> str:
     )
 
 
-def _describe_alone(results: Results, name: str) -> Decision:
+def _describe_single(results: Results, name: str) -> Decision:
     row = results.summary.set_index("configuration").loc[name]
     figures = [_Scale(metric).say(float(row[metric])) for metric in DECIDED_BY if pd.notna(row.get(metric))]
-    return Decision(f"{name}: {', and '.join(figures)}; there is nothing to compare it with.", (name,))
+    return Decision((f"{name}: {', and '.join(figures)}; there is nothing to compare it with.",), (name,))
 
 
 # Of several configurations.
@@ -135,19 +146,33 @@ class _Scale:
         return f"{100 * value:.0f} %" if 0.005 <= value < 0.995 or value in (0, 1) else _format_edge(value)
 
     def tell_difference(self, pair: _JudgedPair) -> str:
-        """`by 0.12 s [0.05, 0.2]`; of one that is not shown, or has no interval, with its sign."""
-        times, unit = (100.0, " percentage points") if self.is_share else (1.0, " s")
-        size, limits = times * pair.difference, (times * pair.limits[0], times * pair.limits[1])
-        if pair.word in (BETTER, WORSE):
-            ends = sorted(map(abs, limits))
-            return f"by {format_limit(abs(size))}{unit} {format_limits(*ends)}"
-        shown = f"{'+' if size > 0 else ''}{format_limit(size)}{unit}"
-        return "" if pair.word == _SAME else shown if pair.word == "" else f"{shown} {format_limits(*limits)}"
+        """`by 0.12 s [0.05, 0.20]`; of one that is not shown, or has no interval, `0.12 s sooner [-0.01, 0.25]`."""
+        if pair.word in (_SAME, _NEAR):
+            return ""
+        claimed = pair.word in (BETTER, WORSE)
+        if self.is_share:
+            size, limits = 100 * pair.difference, tuple(100 * limit for limit in pair.limits)
+            unit, limits = " percentage points", tuple(sorted(map(abs, limits))) if claimed else limits
+            told = format_limit(abs(size)) if claimed else f"{'+' if size > 0 else ''}{format_limit(size)}"
+            shown = f"{told}{unit} {format_limits(*limits)}"
+        else:
+            told = tell_seconds(pair.difference, *pair.limits)
+            shown = told.replace(" later", "").replace(" sooner", "") if claimed else told
+        shown = shown if pair.word else shown.partition(" [")[0]
+        return f"by {shown}" if claimed else shown
 
     def say(self, value: float) -> str:
         """`85 % of conflicts pass`, `an object is known after 0.73 s on average`."""
         number = self.number(value)
         return f"{number} of conflicts pass" if self.is_share else f"an object is known after {number} on average"
+
+
+def tell_seconds(difference_s: float, low_s: float = np.nan, high_s: float = np.nan) -> str:
+    """`0.12 s sooner [-0.01, 0.25]`: a difference of times, and its interval in the direction that the word says."""
+    turn = 1 if difference_s > 0 else -1
+    limits = sorted(round(turn * limit_s, 2) + 0.0 for limit_s in (low_s, high_s))
+    told = f"{abs(difference_s):.2f} s {'later' if difference_s > 0 else 'sooner'}"
+    return told if np.isnan(limits).any() else f"{told} [{limits[0]:.2f}, {limits[1]:.2f}]"
 
 
 def _format_edge(share: float) -> str:
@@ -157,28 +182,38 @@ def _format_edge(share: float) -> str:
 
 
 def decide_compared(
-    comparison: Comparison, experiment: Experiment | None = None, summary: pd.DataFrame | None = None
+    comparison: Comparison,
+    experiment: Experiment | None = None,
+    summary: pd.DataFrame | None = None,
+    parts: Sequence[str] = (),
 ) -> Decision:
     """The decision on a comparison. `experiment`, `summary`: of the one folder that is compared, whose latencies it may
-    be about.
+    be about. `parts`: sentences that stand in place of the differences to the baseline.
 
     The ground truth is no choice.
     """
-    rows = comparison.overall[~comparison.overall["configuration"].isin(comparison.truths)]
-    rows = rows[rows["difference"].notna()]
-    scale = _choose_scale(rows)
-    rows = rows[rows["metric"] == scale.metric]
-    if not len(rows) or comparison.baseline in comparison.truths:
-        return Decision(f"There is no answer: nothing can be held against {comparison.baseline}.")
-    pairs = {str(row.configuration): _JudgedPair.of(row, scale) for row in rows.itertuples(index=False)}
-    brakers, sentence = _tell_needless(comparison, summary)
+    scale, pairs = _judge_pairs(comparison)
+    if not pairs or comparison.baseline in comparison.truths:
+        return Decision((f"There is no answer: nothing can be held against {comparison.baseline}.",))
+    brakers, needless = _tell_needless(comparison, summary)
     gains = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
     gains = {name: gain for name, gain in gains.items() if name not in brakers}
     best = [name for name, gain in gains.items() if not scale.matters(max(gains.values()) - gain)]
     if comparison.baseline in gains and any(name in pairs and pairs[name].word == OPEN for name in best):
         best = [*dict.fromkeys([*best, comparison.baseline])]
-    told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
-    return Decision(f"{told or _tell_groups(comparison.baseline, pairs, scale, brakers)}.{sentence}", tuple(best))
+    if not parts:
+        told = _tell_latencies(comparison.baseline, pairs, scale, experiment)
+        parts = (f"{told or _tell_groups(comparison.baseline, pairs, scale, brakers)}.",)
+    return Decision((*parts, *([needless] if needless else [])), tuple(best))
+
+
+def _judge_pairs(comparison: Comparison, scale: _Scale | None = None) -> tuple[_Scale, dict[str, _JudgedPair]]:
+    """What decides, and each configuration but the truth against the baseline, where both have rows."""
+    rows = comparison.overall[~comparison.overall["configuration"].isin(comparison.truths)]
+    rows = rows[rows["difference"].notna()]
+    scale = scale or _choose_scale(rows)
+    rows = rows[rows["metric"] == scale.metric]
+    return scale, {str(row.configuration): _JudgedPair.of(row, scale) for row in rows.itertuples(index=False)}
 
 
 def _choose_scale(rows: pd.DataFrame) -> _Scale:
@@ -191,7 +226,8 @@ def _choose_scale(rows: pd.DataFrame) -> _Scale:
 class _JudgedPair:
     """A configuration held against the baseline over the rows of both: the values, their difference, its limits.
 
-    `word`: what the interval of this very difference shows; empty: there is none, and a difference.
+    `word`: what the interval of this very difference shows; empty: there is none, and a difference. `over`: what the
+    interval is over, and how many, `11 objects`; empty: nothing.
     """
 
     value: float
@@ -199,6 +235,7 @@ class _JudgedPair:
     difference: float
     limits: tuple[float, float]
     word: str
+    over: str = ""
 
     @staticmethod
     def of(row: Any, scale: _Scale) -> _JudgedPair:
@@ -207,10 +244,13 @@ class _JudgedPair:
         gains = [scale.gain(limit) for limit in limits]
         word = OPEN if min(gains) <= NOTHING and max(gains) >= -NOTHING else BETTER if min(gains) > 0 else WORSE
         if np.isnan(limits).any():
-            word = _SAME if abs(row.difference) < NOTHING else ""
-        elif word != OPEN and not scale.matters(max(gains, key=abs)):
+            alike = getattr(row, "interval", None) == ALL_ALIKE
+            word = _SAME if abs(row.difference) < NOTHING else _ALIKE if alike else ""
+        elif not scale.matters(max(gains, key=abs)):
             word = _NEAR
-        return _JudgedPair(float(row.value), float(row.baseline_value), float(row.difference), limits, word)
+        kind, number = getattr(row, "interval_over", None), getattr(row, "clusters", np.nan)
+        over = "" if pd.isna(kind) or pd.isna(number) else count_noun(int(number), CLUSTERS[str(kind)][0], str(kind))
+        return _JudgedPair(float(row.value), float(row.baseline_value), float(row.difference), limits, word, over)
 
 
 def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale, brakers: Collection[str] = ()) -> str:
@@ -227,8 +267,9 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
         WORSE: f"{worse} than {{}}: ",
         _SAME: "The same as {}: ",
         _NEAR: f"Apart from {{}} by less than {scale.least}: ",
-        OPEN: "No difference to {} is shown: ",
-        "": "No interval, so nothing is shown beyond these very objects, against {}: ",
+        _ALIKE: "By as much in every pair, against {}: ",
+        OPEN: f"No difference to {{}} is shown{_tell_too_few(pairs)}: ",
+        "": "On these objects alone, without an interval, against {}: ",
     }
     words = {
         name: _AT_A_PRICE if pair.word == BETTER and name in brakers else pair.word for name, pair in pairs.items()
@@ -242,20 +283,116 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
     return "; ".join(parts)
 
 
+def _tell_too_few(pairs: Mapping[str, _JudgedPair]) -> str:
+    """`, for 11 objects are too few`; nothing where pairs with an open difference are over different numbers."""
+    [*over] = {pair.over for pair in pairs.values() if pair.word == OPEN}
+    return f", for {over[0]} are too few" if len(over) == 1 and over[0] else ""
+
+
 def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
     """`A and B by 0.12 s [0.05, 0.2], C by …`, the best first; those of equal words together, of many the first."""
     by_words: dict[str, list[str]] = {}
     for name, pair in sorted(pairs.items(), key=lambda item: -scale.gain(item[1].difference)):
         by_words.setdefault(scale.tell_difference(pair), []).append(name)
-    shown, left = [], _NAMED
+    most = _NAMED if len(pairs) > _NAMED + 1 else len(pairs)  # one more takes no more room than to say so
+    shown, left = [], most
     for words, names in by_words.items():
         kept = names[:left]
         left -= len(kept)
         if kept:
             listed = " and ".join([", ".join(kept[:-1])] * (len(kept) > 1) + kept[-1:])
             shown.append(f"{listed} {words}".rstrip())
-    more = len(pairs) - _NAMED
+    more = len(pairs) - most
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+# In parts.
+
+
+def _tell_parts(results: Results, comparison: Comparison, names: Sequence[str]) -> Iterator[str]:
+    """What cooperation brings against the car alone, what fusion costs against the ideal of the same lists, what
+    latency costs against the same without it; then the rest against the car alone.
+
+    Nothing without a car alone (`find_alone`), or where none of `names` has another unit.
+    """
+    alone, experiment = find_alone(results, names), results.experiment
+    own = set() if alone is None else set(experiment.units_of(experiment.configurations[alone]))
+    inputs = {name: set(experiment.units_of(of)) for name, of in experiment.configurations.items() if name in names}
+    on_ego = {unit for unit, of in experiment.units.items() if of.on == "ego"}
+    together = {name for name in names if (inputs[name] - on_ego if own <= on_ego else inputs[name] > own)}
+    if alone is None or not together:
+        return
+    ideals = {n: str(of.ideal) for n in names if (of := results.facts[n]).ideal_of == "inputs" and of.ideal in names}
+    scale, brakers = _judge_pairs(comparison)[0], find_brakers(comparison)
+    shown = [name for name in names if name in together - {*ideals.values()}]
+    pairs = _hold_against(results, dict.fromkeys(shown, alone), scale)
+    latencies = _tell_latencies(alone, pairs, scale, experiment)
+    if pairs:
+        yield (
+            f"{latencies}." if latencies else f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}."
+        )
+    if ideals and (fused := _hold_against(results, ideals, scale)):
+        [*against] = {*ideals.values()}
+        told = _tell_groups(against[0] if len(against) == 1 else _IDEAL, fused, scale, brakers)
+        yield f"Fusion: {_start_low(told)}."
+    twins = {} if latencies else _find_twins(experiment, names)
+    if late := _hold_against(results, {name: twin for name, (twin, _) in twins.items()}, scale):
+        yield f"Latency: {_tell_costs(late, twins, scale)}."
+    rest = [name for name in names if name not in {alone, *shown, *ideals, *ideals.values(), *twins}]
+    if beside := _hold_against(results, dict.fromkeys(rest, alone), scale):
+        yield f"Beside them: {_start_low(_tell_groups(alone, beside, scale, brakers))}."
+
+
+def _start_low(sentence: str) -> str:
+    return sentence[:1].lower() + sentence[1:]
+
+
+def _hold_against(results: Results, against: Mapping[str, str], scale: _Scale) -> dict[str, _JudgedPair]:
+    """Configurations, each against another one, where both have rows."""
+    found: dict[str, _JudgedPair] = {}
+    for baseline in dict.fromkeys(against.values()):
+        names = [name for name, other in against.items() if other == baseline]
+        compared = compare_folders([results], configurations=names, baseline=baseline, metrics=(scale.metric,))
+        found |= _judge_pairs(compared, scale)[1]
+    return {name: found[name] for name in against if name in found}
+
+
+def _find_twins(experiment: Experiment, names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Configurations that differ from one with a smaller latency in nothing else: that one, and `0.4 s more`."""
+    groups: list[tuple[Configuration, dict[str, float]]] = []
+    for name in names:
+        own = experiment.configurations[name]
+        if own.recorded is not None or isinstance(own.latency_s, dict):
+            continue
+        plain = own.model_copy(update={"latency_s": 0.0})
+        latencies_s = next((of_alike for of, of_alike in groups if of == plain), None)
+        if latencies_s is None:
+            groups.append((plain, latencies_s := {}))
+        latencies_s[name] = own.latency_s
+    twins: dict[str, tuple[str, str]] = {}
+    for _, latencies_s in groups:
+        first = min(latencies_s, key=lambda name: latencies_s[name])
+        for name, latency_s in latencies_s.items():
+            if (more_s := latency_s - latencies_s[first]) > 0:
+                twins[name] = first, f"{more_s:g} s{' more' * (latencies_s[first] > 0)}"
+    return twins
+
+
+def _tell_costs(pairs: Mapping[str, _JudgedPair], twins: Mapping[str, tuple[str, str]], scale: _Scale) -> str:
+    """`0.5 s costs 0.51 s [0.50, 0.52] (late against gnn)`, those of equal words together."""
+    verbs = {_SAME: "changes nothing", _NEAR: f"changes less than {scale.least}", OPEN: "is not shown to matter:"}
+    tails, by_words = {_ALIKE: ", alike in every pair", "": " on these objects alone"}, dict[str, list[str]]()
+    for name, pair in pairs.items():
+        first, latency = twins[name]
+        verb, size = verbs.get(pair.word), scale.tell_difference(pair)
+        if verb is None:
+            verb = "gains" if scale.gain(pair.difference) > 0 else "costs"
+            size = re.sub("^by |^[+-]| later| sooner", "", size)
+        words = f"{latency} {verb} {size}".rstrip() + tails.get(pair.word, "")
+        by_words.setdefault(words, []).append(f"{name} against {first}")
+    told = [f"{words} ({', '.join(of[:_NAMED])}{' …' * (len(of) > _NAMED)})" for words, of in by_words.items()]
+    more = f"; and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
+    return "; ".join(told[:_NAMED]) + more
 
 
 # Who brakes for nothing.
@@ -289,7 +426,7 @@ def _tell_needless(comparison: Comparison, summary: pd.DataFrame | None) -> tupl
     if summary is not None:
         of = summary.set_index("configuration")
     driving = "the driving time" if of is None else _describe_driving(float(of["driving_h"].max()))
-    told = f" But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
+    told = f"But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
     told += "".join(f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED])
     told += f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     told += f" ({against}: {'never' if least == 0 else _format_share(least)})"
@@ -319,10 +456,16 @@ def _tell_latencies(
     latencies_s, units = found
     names, judged, order = list(latencies_s), [pairs[name].word for name in latencies_s], [BETTER, OPEN, WORSE]
     bases = [pair.base for pair in pairs.values()]
-    if not {*judged} <= {*order} or sorted(judged, key=order.index) != judged or max(bases) - min(bases) > NOTHING:
+    if BETTER not in judged or len({*judged}) == 1 or not {*judged} <= {*order}:
+        return None  # no latency parts them, or each has to be named
+    if sorted(judged, key=order.index) != judged or max(bases) - min(bases) > NOTHING:
         return None  # not in the order of latencies, or not over the same rows: each has to be named
     cooperates = units > set(experiment.units_of(experiment.configurations[baseline]))
-    what, none = ("cooperation", f"{baseline} alone") if cooperates else (names[0].partition(":")[0], baseline)
+    what, none = (
+        ("cooperation", baseline if "alone" in baseline else f"{baseline} alone")
+        if cooperates
+        else (names[0].partition(":")[0], baseline)
+    )
     parts: list[str] = []
     for word, says in ((BETTER, f"{what} helps"), (OPEN, f"no difference to {none} is shown")):
         if word in judged:
@@ -359,75 +502,3 @@ def _order_by_latency(
     if len(set(numbers.values())) < len(names):
         return None
     return dict(sorted(numbers.items(), key=itemgetter(1))), units
-
-
-# Of one object in one run: what would help.
-
-_KEYS = {
-    "units": "units", "link": "link", "latency_s": "latency", "fusion": "fusion", "issue_hz": "issue rate",
-    "max_age_s": "greatest age",
-}  # fmt: skip
-"""Keys of configurations that are compared, and their words."""
-_MOST_UNITS = 3
-"""Most units that a sentence names."""
-
-
-def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
-    """What would help the configuration that knows an object last: “What would help PEM: the lists of mast1 as well …”.
-
-    It is another configuration that knows the object earlier, with the same draws, and differs in one key or has more
-    units: of those with the fewest other keys the earliest; “” where there is none. `rows`: of one object and run, a
-    row per configuration.
-    """
-    asked = {name: experiment.configurations[name] for name in rows["configuration"]}
-    known_s = dict(zip(rows["configuration"], rows["time_to_detection_s"].fillna(np.inf).tolist(), strict=True))
-    names = [name for name, one in asked.items() if one.recorded is None and one.units != TRUTH]
-    last_s = max((known_s[name] for name in names), default=0.0)
-    pairs = [
-        (len(keys), known_s[other], last, other, change)
-        for last in names
-        for other in names
-        if known_s[last] == last_s > known_s[other] + SAME_INSTANT_S
-        and (change := _describe_change(experiment, keys := _find_changed_keys(experiment, last, other), last, other))
-    ]
-    if not pairs:
-        return ""
-    _, best_s, last, best, change = min(pairs, key=itemgetter(0, 1))
-    gain = (
-        f"{last_s - best_s:.2f} s earlier"
-        if np.isfinite(last_s)
-        else f"{best_s:.2f} s after the onset instead of never"
-    )
-    return f"What would help {last}: {change}, as in {best}: known {gain}, with the same draws."
-
-
-def _find_changed_keys(experiment: Experiment, last: str, other: str) -> list[str]:
-    return [key for key in _KEYS if _value_of(experiment, key, last) != _value_of(experiment, key, other)]
-
-
-def _value_of(experiment: Experiment, key: str, name: str) -> Any:
-    asked = experiment.configurations[name]
-    return frozenset(experiment.units_of(asked)) if key == "units" else getattr(asked, key)
-
-
-def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, best: str) -> str:
-    """What is better in the other one: “0 s of latency instead of 1.5 s”; “” where much is different."""
-    values = {key: (_value_of(experiment, key, last), _value_of(experiment, key, best)) for key in keys}
-    old_units, new_units = values.pop("units", (frozenset(), frozenset()))
-    rest = f" (and another {' and '.join(_KEYS[key] for key in values)})" if values else ""
-    if new_units > old_units:
-        return f"the lists of {_name_units(new_units - old_units)} as well{rest}"
-    if len(keys) != 1:
-        return ""
-    if not values:
-        return f"the lists of {_name_units(new_units)} instead"
-    [(key, (old, new))] = values.items()
-    if key == "latency_s" and not isinstance(old, dict) and not isinstance(new, dict):
-        return f"{new:g} s of latency instead of {old:g} s"
-    if key == "fusion" and old.kind != new.kind:
-        return f"fusion {new.kind} instead of {old.kind}"
-    return "no link" if key == "link" and new is None else f"another {_KEYS[key]}"
-
-
-def _name_units(units: frozenset[str]) -> str:
-    return ", ".join(sorted(units)) if len(units) <= _MOST_UNITS else count_noun(len(units), "unit")

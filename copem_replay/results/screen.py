@@ -22,7 +22,7 @@ from copem_replay.metrics.summary import describe_no_needless
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import NOTHING
-from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE
+from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE, tell_seconds
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
@@ -266,8 +266,7 @@ def _tell_difference(metric: str, row: Any) -> str:
     if metric == "ttd_rmst_s":
         if abs(size) < MATTERS_S and (not known or max(abs(row.low), abs(row.high)) < MATTERS_S):
             return "as soon"
-        told = f"{abs(size):.2f} s {'later' if size > 0 else 'sooner'}"
-        limits = limits if size > 0 else (-row.high, -row.low) if known else limits
+        told, known = tell_seconds(size, row.low, row.high), False
     else:
         size, limits = (100 * size, (100 * row.low, 100 * row.high)) if "share" in metric else (size, limits)
         told = (

@@ -12,7 +12,7 @@ import pandas as pd
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.results.decision import tell_what_helps
+from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes

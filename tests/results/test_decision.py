@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
+import yaml
 
 import copem_replay as cr
 from copem_replay.results.compare import Comparison
-from copem_replay.results.decision import Decision, decide, decide_compared, describe_verdicts, tell_what_helps
+from copem_replay.results.decision import Decision, decide, decide_compared, describe_verdicts
 from copem_replay.results.table_files import LogRows
 from copem_replay.results.verdicts import MET, NOT_MET, UNDECIDED, Judgement, Verdict
 from tests.helpers.recordings import Obj, pedestrian, write_recording
-from tests.helpers.scenes import experiment
 
 Row = tuple[str, float, float, float | None, float | None]
 """Configuration, its value, that of the baseline, and the limits of the difference."""
@@ -71,8 +72,8 @@ class TestLatencies:
         )
         assert found.sentence == (
             "Without latency cooperation helps: an object is known after 0.00 s on average against 0.70 s with PEM "
-            "alone, by 0.7 s [0.6, 0.8]; up to 1 s of latency no difference to PEM alone is shown: 0.90 s, +0.2 s "
-            "[-0.1, 0.5]."
+            "alone, by 0.70 s [0.60, 0.80]; up to 1 s of latency no difference to PEM alone is shown: 0.90 s, 0.20 s "
+            "later [-0.10, 0.50]."
         )
 
     def test_out_of_their_order_each_is_named(self) -> None:
@@ -81,8 +82,8 @@ class TestLatencies:
             cooperating(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
-            "Sooner than PEM (an object is known after 0.70 s on average): co1 by 0.6 s [0.5, 0.7]; later than PEM: "
-            "co0 by 0.2 s [0.1, 0.3]."
+            "Sooner than PEM (an object is known after 0.70 s on average): co1 by 0.60 s [0.50, 0.70]; later than PEM: "
+            "co0 by 0.20 s [0.10, 0.30]."
         )
 
 
@@ -98,7 +99,7 @@ class TestGroups:
                 truths=("GT",),
             )
         )
-        assert found == Decision(
+        assert (found.sentence, found.best) == (
             "Better than PEM (50 % of conflicts pass): a by 40 percentage points [30, 50]; worse than PEM: c by 30 "
             "percentage points [20, 40]; no difference to PEM is shown: b +10 percentage points [-10, 30].",
             ("a",),
@@ -114,29 +115,29 @@ class TestGroups:
     def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -1.2, 0.2), ("b", 2.0, 1.0, 0.5, 1.5)))
         assert found.sentence == (
-            "Later than PEM (an object is known after 1.00 s on average): b by 1 s [0.5, 1.5]; no difference to PEM is "
-            "shown: a -0.5 s [-1.2, 0.2]."
+            "Later than PEM (an object is known after 1.00 s on average): b by 1.00 s [0.50, 1.50]; no difference to "
+            "PEM is shown: a 0.50 s sooner [-0.20, 1.20]."
         )
         assert set(found.best) == {"a", "PEM"}
 
     def test_without_intervals_it_says_so(self) -> None:
         found = decide_compared(compared("pass_share", ("a", 1.0, 0.0, None, None)))
         assert found.sentence == (
-            "No interval, so nothing is shown beyond these very objects, against PEM (0 % of conflicts pass): a +100 "
-            "percentage points."
+            "On these objects alone, without an interval, against PEM (0 % of conflicts pass): a +100 percentage "
+            "points."
         )
 
     def test_each_is_held_against_the_rows_of_its_own_pair(self) -> None:
         """Of b half of the logs have no units: the baseline is slower there, and no mean of all rows is compared."""
         found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -0.6, -0.4), ("b", 1.2, 1.5, -0.4, -0.2)))
-        assert found.sentence == "Sooner than PEM: a by 0.5 s [0.4, 0.6], b by 0.3 s [0.2, 0.4]."
+        assert found.sentence == "Sooner than PEM: a by 0.50 s [0.40, 0.60], b by 0.30 s [0.20, 0.40]."
         assert found.best == ("a",)
 
     def test_who_is_the_same_in_every_pair_is_said_to_be(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 1.0, 1.0, None, None), ("b", 1.0, 1.0, -0.1, 0.1)))
         assert found.sentence == (
-            "The same as PEM (an object is known after 1.00 s on average): a; no difference to PEM is shown: b 0 s "
-            "[-0.1, 0.1]."
+            "The same as PEM (an object is known after 1.00 s on average): a; no difference to PEM is shown: b 0.00 s "
+            "sooner [-0.10, 0.10]."
         )
 
     def test_equal_figures_share_a_number_and_many_are_counted(self) -> None:
@@ -173,17 +174,19 @@ class TestBrakingForNothing:
 
     def test_who_brakes_for_nothing_is_sooner_at_a_price(self) -> None:
         assert self.decided(("a", 0.25, 0.0, 0.2, 0.3), ("b", 0.0, 0.0, 0.0, 0.0)) == Decision(
-            "Sooner than PEM (an object is known after 1.00 s on average): b by 0.3 s [0.2, 0.4]; sooner than PEM, but "
-            "braking for nothing: a by 0.5 s [0.4, 0.6]. But with a the driver brakes for nothing in 25 % of the "
-            "driving time (PEM: never).",
+            (
+                "Sooner than PEM (an object is known after 1.00 s on average): b by 0.30 s [0.20, 0.40]; sooner than "
+                "PEM, but braking for nothing: a by 0.50 s [0.40, 0.60].",
+                "But with a the driver brakes for nothing in 25 % of the driving time (PEM: never).",
+            ),
             ("b",),
         )
 
     def test_where_the_baseline_does_the_others_are_held_against_the_best_of_them(self) -> None:
         found = self.decided(("a", 0.0, 0.25, -0.3, -0.2), ("b", 0.25, 0.25, -0.01, 0.01))
         assert found.best == ("a",)
-        assert found.sentence.startswith("Sooner than PEM (an object is known after 1.00 s on average): a by 0.5 s")
-        assert "; sooner than PEM, but braking for nothing: b by 0.3 s" in found.sentence
+        assert found.sentence.startswith("Sooner than PEM (an object is known after 1.00 s on average): a by 0.50 s")
+        assert "; sooner than PEM, but braking for nothing: b by 0.30 s" in found.sentence
         assert (
             "But with b the driver brakes for nothing in 25 % of the driving time, with PEM in 25 %" in found.sentence
         )
@@ -200,6 +203,91 @@ class TestBrakingForNothing:
         found = self.decided(share, ("b", 0.0, 0.0, 0.0, 0.0))
         assert found.best == ("a",)
         assert "nothing" not in found.sentence
+
+
+SPEEDS_MPS = {2: 4.0, 3: 5.0, 4: 8.0, 5: 10.0, 6: 2.5}
+"""Of people who walk up to the ego: 20 m later by 5, 4, 2.5, 2 and 8 s, of which 3 s count."""
+APPROACH = """\
+version: 1
+logs: [drive.mcap]
+pems:
+  near: [{when: {range_m: [0, 20]}, detection: {kind: constant, probability: 1}}]
+  far: [{detection: {kind: constant, probability: 1}}]
+units:
+  ego: {on: ego, height_m: 1.8, pem: near}
+  more: {on: ego, height_m: 1.8, pem: far}
+  mast: {at: [0, 0], height_m: 5, pem: far}
+configurations: {%s}
+measure: {objects: {classes: [pedestrian]}, onset: {kind: in_range, range_m: 40}, horizon_s: 3, accuracy: false}
+show: null
+"""
+
+
+def approached(place: Path, **configurations: str) -> tuple[str, ...]:
+    """What is decided of people whom the ego knows from 20 m on, the mast from anywhere; from 40 m on it counts."""
+    frames = [
+        (0.1 * k, [Obj(id=1), *(pedestrian(id, 40 + v * (0.25 - 0.1 * k), vx=-v) for id, v in SPEEDS_MPS.items())])
+        for k in range(60)
+    ]
+    write_recording(place / "drive.mcap", frames, host=1)
+    of = ", ".join(f"{name}: {{units: {asked}}}" for name, asked in configurations.items())
+    (place / "plan.yaml").write_text(APPROACH % of)
+    return decide(cr.run(place / "plan.yaml", jobs=1)).sentences
+
+
+class TestParts:
+    """Alone an object is known after 3, 3, 2.5, 2 and 3 s, 2.7 s on average."""
+
+    def test_cooperation_fusion_and_latency_each_against_its_own(self, tmp_path: Path) -> None:
+        cooperation, fusion, latency = approached(
+            tmp_path,
+            GT="truth",
+            ideal="[ego, mast]",
+            gnn="[ego, mast], fusion: {kind: gnn}",
+            alone="[ego], fusion: {kind: gnn}",
+            late="[ego, mast], fusion: {kind: gnn}, latency_s: 0.5",
+        )
+        assert re.fullmatch(
+            r"Cooperation: sooner than alone \(an object is known after 2\.70 s on average\): gnn by 2\.70 s "
+            r"\[2\.\d\d, 3\.\d\d\], late by 2\.20 s \[1\.\d\d, 2\.\d\d\]\.",
+            cooperation,
+        )
+        assert fusion == "Fusion: the same as ideal (an object is known after 0.00 s on average): gnn."
+        assert latency == "Latency: 0.5 s costs 0.50 s, alike in every pair (late against gnn)."
+
+    def test_an_ideal_whose_lists_nobody_else_has_is_cooperation(self, tmp_path: Path) -> None:
+        [cooperation] = approached(tmp_path, car="[ego]", both="[ego, mast]")
+        assert cooperation.startswith("Cooperation: sooner than car (an object is known after 2.70 s on average): both")
+
+    def test_who_is_neither_stands_beside_them(self, tmp_path: Path) -> None:
+        """Another sensor of the car is no cooperation."""
+        _, beside = approached(tmp_path, car="[ego]", better="[ego, more]", both="[ego, mast]")
+        assert beside.startswith("Beside them: sooner than car (an object is known after 2.70 s on average): better by")
+
+    def test_of_the_car_alone_there_are_no_parts(self, tmp_path: Path) -> None:
+        [told] = approached(tmp_path, car="[ego]", better="[ego, more]")
+        assert told.startswith("Sooner than car (an object is known after 2.70 s on average): better by 2.70 s [")
+
+    def test_latencies_between_which_the_help_ends_are_the_sentence(self, tmp_path: Path) -> None:
+        [told] = approached(tmp_path, car="[ego]", at_once="[ego, mast]", late="[ego, mast], latency_s: 2.9")
+        assert told.startswith("Without latency cooperation helps: an object is known after 0.00 s on average against ")
+        assert "; up to 2.9 s of latency no difference to car alone is shown: 2.90 s, 0.20 s later [" in told
+
+    def test_without_a_car_the_best_single_unit_is_alone(self, tmp_path: Path) -> None:
+        """Each of two masts alone; together they know no sooner than the better one."""
+        units = {
+            "mast": {"at": [0, 0], "height_m": 5, "pem": "far"},
+            "other": {"at": [0, 0], "height_m": 5, "pem": "near"},
+        }
+        plain = yaml.safe_load(APPROACH % "other: {units: [other]}, mast: {units: [mast]}, both: {units: all}")
+        plain |= {"units": units, "logs": [str(tmp_path / "drive.mcap")]}
+        plain["measure"]["distance_to"] = "mast"
+        approached(tmp_path, car="[ego]")
+        found = decide(cr.run(plain, jobs=1)).sentences
+        assert found == (
+            "Cooperation: the same as mast (an object is known after 0.00 s on average): both.",
+            "Beside them: later than mast (an object is known after 0.00 s on average): other by 2.70 s [2.14, 3.00].",
+        )
 
 
 def test_criteria_are_the_sentence() -> None:
@@ -240,79 +328,3 @@ def test_results_are_decided_on_without_rows_of_accuracy(tmp_path: Path, monkeyp
     assert set(read) == {"detections.parquet"}
     cr.compare(result)
     assert {"accuracy.parquet", "instants.parquet"} <= set(read)
-
-
-# ------------------------------------------------------------------------------- what would help with one object
-
-
-def helps(known_s: dict[str, float | None]) -> str:
-    """The sentence on an object that configurations know after some seconds; None: never."""
-    units = {name: {"at": [0, k], "height_m": 5.0, "pem": "sure"} for k, name in enumerate(("m1", "m2", "m3", "m4"))}
-    given = experiment(
-        units=units,
-        links={"radio": {"latency": 0.1}},
-        configurations={
-            "GT": {"units": "truth"},
-            "one": {"units": ["m1"]},
-            "two": {"units": ["m1", "m2"]},
-            "all": {"units": "all"},
-            "late": {"units": "all", "latency_s": 1.5},
-            "gnn": {"units": "all", "fusion": {"kind": "gnn"}},
-            "air": {"units": "all", "link": "radio"},
-            "other": {"units": ["m3", "m4"], "fusion": {"kind": "gnn"}, "latency_s": {"default": 0.5}},
-        },
-    )
-    return tell_what_helps(
-        given, pd.DataFrame({"configuration": [*known_s], "time_to_detection_s": [*known_s.values()]})
-    )
-
-
-@pytest.mark.parametrize(
-    ("known_s", "change"),
-    [
-        ({"all": 0.2, "late": 1.7}, "late: 0 s of latency instead of 1.5 s, as in all: known 1.50 s earlier"),
-        (
-            {"two": 0.2, "one": None},
-            "one: the lists of m2 as well, as in two: known 0.20 s after the onset instead of never",
-        ),
-        ({"two": 0.9, "all": 0.0}, "two: the lists of m3, m4 as well, as in all: known 0.90 s earlier"),
-        ({"one": 0.1, "two": 0.4}, "two: the lists of m1 instead, as in one: known 0.30 s earlier"),
-        ({"all": 0.1, "gnn": 0.4}, "gnn: fusion ideal instead of gnn, as in all: known 0.30 s earlier"),
-        ({"all": 0.1, "air": 0.4}, "air: no link, as in all: known 0.30 s earlier"),
-        ({"air": 0.1, "all": 0.4}, "all: another link, as in air: known 0.30 s earlier"),
-        ({"two": 0.1, "all": 0.0, "one": 3.0}, "one: the lists of m2, m3, m4 as well, as in all: known 3.00 s earlier"),
-        (
-            {"other": None, "one": None, "two": 1.0},
-            "one: the lists of m2 as well, as in two: known 1.00 s after the onset instead of never",
-        ),
-        # With more units more keys may differ; fewer come first.
-        (
-            {"one": 3.0, "gnn": 0.5},
-            "one: the lists of m2, m3, m4 as well (and another fusion), as in gnn: known 2.50 s earlier",
-        ),
-        (
-            {"other": None, "air": 0.5},
-            "other: the lists of m1, m2 as well (and another link and latency and fusion), as in air: known "
-            "0.50 s after the onset instead of never",
-        ),
-        ({"one": 3.0, "gnn": 0.0, "two": 1.0}, "one: the lists of m2 as well, as in two: known 2.00 s earlier"),
-    ],
-)
-def test_one_key_of_another_configuration_would_help(known_s: dict[str, float | None], change: str) -> None:
-    assert helps(known_s) == f"What would help {change}, with the same draws."
-
-
-@pytest.mark.parametrize(
-    "known_s",
-    [
-        {},
-        {"one": 0.3},
-        {"GT": 0.0, "one": 0.3},
-        {"all": 0.3, "late": 0.3},
-        {"late": None, "all": None},
-        {"other": 2.0, "one": 0.0},  # it has other units, and more keys are different
-        {"late": 1.0, "gnn": 0.0},
-    ],
-)
-def test_what_would_help_is_not_made_up(known_s: dict[str, float | None]) -> None:
-    assert helps(known_s) == ""

@@ -23,7 +23,7 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.paths import Drive, find_latest_log, read_drive
 from copem_replay.report.html.markup import Html, make_tag
 from copem_replay.report.html.study import NO_RECORDING, ReportData
-from copem_replay.results.decision import tell_what_helps
+from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import choose_shown_objects
 
 _NAMED = 6

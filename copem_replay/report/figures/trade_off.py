@@ -58,7 +58,7 @@ def no_trade_off(results: Results, names: Sequence[str]) -> str | None:
 def trade_off_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Seconds sooner than the car alone against the time braking for nothing; lower right is better."""
     names = list(find_contenders(results, results.chosen(configurations)))
-    alone = find_alone(results, names)
+    alone = find_alone(results, names) or names[0]
     compared = compare_folders([results], configurations=names, baseline=alone, metrics=[RANKED_BY]).overall
     sooner_s = {alone: 0.0} | dict(zip(compared["configuration"], -compared["difference"].astype(float), strict=True))
     share = 100 * results.summary.set_index("configuration")[SHARE].astype(float)

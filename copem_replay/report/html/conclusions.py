@@ -1,4 +1,4 @@
-"""The answer in words: the decision, differences to the best, what varies most, and, folded, how sure that is."""
+"""The answer in words: the decision, what else stands out, what varies most, and, folded, how sure that is."""
 
 from __future__ import annotations
 
@@ -11,37 +11,35 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.metrics.braking.driving import SHARE
-from copem_replay.metrics.limits import ALL_ALIKE, NOT_ENOUGH, NOTHING_DRAWN
+from copem_replay.metrics.limits import NOT_ENOUGH, NOTHING_DRAWN
 from copem_replay.report.figures.style import (
-    RANKED_BY,
     describe_over,
     explain_no_intervals,
     find_with_fewer_rows,
     format_per_cent,
     format_signed_decimals,
-    format_three_digits,
     format_two_decimals,
     write_limits,
 )
 from copem_replay.report.html.markup import Html, escape_text, fold_parts, join_html, make_list, make_tag
 from copem_replay.report.html.setup import join_names, shorten_list
-from copem_replay.report.html.study import ReportData, detects_at_onset, explain_missing_interval
+from copem_replay.report.html.study import ReportData
 from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.tables import NOTHING, describe_gain
-from copem_replay.results.decision import MATTERS_S, decide, find_brakers
+from copem_replay.results.decision import decide
 
 _INTERVAL = re.compile(r"(?:[^\s(]+ (?:s|%|percentage points) )?\[[^\[\]<]*\]")
 
 
 def write_lead(study: ReportData) -> Html:
-    """The decision, in one sentence."""
-    return make_tag("p", decide(study.results, study.regret, study.verdicts).sentence, class_="lead")
+    """The decision, a paragraph a sentence."""
+    sentences = decide(study.results, study.regret, study.verdicts).sentences
+    return join_html([make_tag("p", _prevent_breaks(sentence), class_="lead") for sentence in sentences])
 
 
 def write_details(study: ReportData) -> Html:
-    """Differences to the best with intervals, what varies most; caveats below, folded."""
-    if study.best is None:
+    """What else stands out, what varies most; caveats below, folded."""
+    if not len(study.results.known):
         return make_list(str(note) for note in study.provenance.get("notes", []))
     caveats = [*_caveat_sentences(study)]
     return join_html(
@@ -64,9 +62,6 @@ def _detail_sentences(study: ReportData) -> Iterator[str]:
     contenders = study.contenders
     share = rows["detected_share"].astype(float)
     if share[list(contenders)].any():
-        yield _soonest_sentence(study)
-        yield from _needless_sentences(study)
-        yield from _other_sentences(study)
         yield from _detected_sentences(study, share)
     yield from _pass_sentences(study)
     yield from _variation_sentences(study)
@@ -74,51 +69,10 @@ def _detail_sentences(study: ReportData) -> Iterator[str]:
 
 def _caveat_sentences(study: ReportData) -> Iterator[str]:
     """On what the answer is over, and what it leaves out."""
-    if study.lead is not None:
-        later, _, _, unsure = _split_by_difference(study.lead)
-        yield from _missing_sentences(study, unsure)
-        if len(later) and len(study.contenders) > 2:
-            yield f"The same figures pick the winner{'s' * (len(study.as_soon) > 1)}, which flatters it a little."
     yield from _elsewhere_sentences(study)
     yield from _truth_sentences(study)
     yield from _certainty_sentences(study)
     yield from _left_out_sentences(study)
-
-
-def _soonest_sentence(study: ReportData) -> Html:
-    assert study.best is not None
-    mean_s, horizon_s = (float(study.of(study.best)[key]) for key in (RANKED_BY, "ttd_rmst_horizon_s"))
-    missed = (study.results.summary["detected_share"] < 1).any()
-    counted_as = f" (an object that is never detected counts as {format_three_digits(horizon_s)} s)" if missed else ""
-    name = make_tag("b", study.best)
-    if study.lead is None:
-        only = "it is the only configuration" if len(study.names) == 1 else "only the ground truth is beside it"
-        after = f" detects after {format_two_decimals(mean_s)} s on average{counted_as}."
-        return join_html([name, f"{after} There is nothing to compare it with: {only}."])
-    tied = study.as_soon
-    if len(tied) == 1:
-        return _first_sentence(study, name, mean_s, counted_as)
-    _, alike, sooner, _ = _split_by_difference(study.lead)
-    when = "every object at its onset"
-    if not detects_at_onset(study):
-        when = f"at the same times: after {format_two_decimals(mean_s)} s on average{counted_as}"
-    not_tied = len(study.lead.configurations) + 1 - len(tied)
-    undecided = sum(name not in tied for rows in (alike, sooner) for name in rows["configuration"])
-    others = f"the other {not_tied}" if not_tied > 1 else "the other"
-    below = f" {others[:1].upper()}{others[1:]} {'are' if not_tied > 1 else 'is'} below." if not_tied else ""
-    if undecided:
-        to = others if undecided == not_tied else f"{undecided} of {others}"
-        below = f" The interval of their difference to {to} includes 0."
-    return join_html([make_tag("b", join_names(tied)), f" detect {when}.{below}"])
-
-
-def _needless_sentences(study: ReportData) -> Iterator[str]:
-    """With whom of the soonest the driver brakes for nothing."""
-    brakers = set() if study.regret is None else find_brakers(study.regret)
-    for name in study.as_soon:
-        if name in brakers:
-            share = format_per_cent(study.of(name)[SHARE])
-            yield f"With {name} the driver brakes for nothing in {share} % of the driving time."
 
 
 def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
@@ -128,95 +82,6 @@ def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
             f"{join_names(list(fewer))} {'is' if len(fewer) == 1 else 'are'} ranked last: some logs lack the units, "
             "and means and shares are over the others alone. Differences are over what both have."
         )
-
-
-def _missing_sentences(study: ReportData, unsure: pd.DataFrame) -> Iterator[str]:
-    """That differences have no interval, and why."""
-    if not len(unsure):
-        return
-    assert study.lead is not None
-    tied = study.as_soon
-    all_tied = all(rows["configuration"].isin(tied).all() for rows in _split_by_difference(study.lead)[:3])
-    apart = unsure[unsure["difference"].abs() > NOTHING]
-    of_names = (
-        ""
-        if all_tied
-        else f" of the difference to {join_names(list((apart if len(apart) else unsure)['configuration']))}"
-    )
-    yield f"No interval{of_names}: {explain_missing_interval(study, unsure)}."
-
-
-def _first_sentence(study: ReportData, name: Html, mean_s: float, counted_as: str) -> Html:
-    """The answer if no other configuration detects at the same times as the best one."""
-    assert study.lead is not None
-    later, alike, sooner, unsure = _split_by_difference(study.lead)
-    undecided, others = len(alike) + len(sooner), len(study.lead.configurations)
-    level = list(unsure.loc[unsure["difference"].abs() <= NOTHING, "configuration"])
-    if level:
-        names = make_tag("b", join_names([str(study.best), *level]))
-        mean = f" have the same mean time, {format_two_decimals(mean_s)} s{counted_as},"
-        return join_html([names, f"{mean} though they do not always detect at the same time."])
-    near = _metric_rows(study.lead, RANKED_BY).query("abs(difference) < @MATTERS_S")["configuration"]
-    if len(near):
-        names = make_tag("b", join_names([str(study.best), *near]))
-        return join_html(
-            [
-                names,
-                f" detect soonest, after {format_two_decimals(mean_s)} s on average{counted_as}: differences below "
-                f"{MATTERS_S:g} s name no winner.",
-            ]
-        )
-    rivals = f"the other {others}" if others > 1 else study.lead.configurations[0]
-    has, sure = f" has the shortest mean time, {format_two_decimals(mean_s)} s", ""
-    if len(later) == others:
-        has, sure = f" detects soonest, after {format_two_decimals(mean_s)} s on average", f", sooner than {rivals}"
-    elif undecided:
-        to = f"{undecided} of {rivals}" if undecided < others else rivals
-        sure = f", but the interval of its difference to {to} includes 0"
-    return join_html([name, f"{has}{counted_as}{sure}."])
-
-
-def _split_by_difference(lead: Comparison) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Rows of differences to the best: interval above 0 (later), including 0, below 0 (sooner), without interval."""
-    rows = _metric_rows(lead, RANKED_BY)
-    rows = rows[rows["difference"].notna()].sort_values("difference", kind="stable")
-    same = rows["interval"].isin([ALL_ALIKE, NOTHING_DRAWN]) & (rows["difference"].abs() <= NOTHING)
-    unsure = (rows["interval_over"].isna() | rows["low"].isna() | rows["high"].isna()) & ~same
-    later = ~unsure & (rows["low"] > NOTHING)
-    sooner = ~unsure & (rows["high"] < -NOTHING)
-    return rows[later], rows[~unsure & ~later & ~sooner], rows[sooner], rows[unsure]
-
-
-def _other_sentences(study: ReportData) -> Iterator[str]:
-    """The other configurations, by the interval of their difference to the best."""
-    if study.lead is None:
-        return
-    tied = study.as_soon
-    later, alike, sooner, unsure = (
-        rows[~rows["configuration"].isin(tied)] for rows in _split_by_difference(study.lead)
-    )
-    if len(tied) == 1:  # nearer ones share the first place, in a sentence of their own
-        alike = alike[alike["difference"].abs() >= MATTERS_S]
-    unsure = unsure[unsure["difference"].abs() > NOTHING]
-    if len(later):
-        yield f"Later, the interval of the difference excluding 0: {_list_differences(later)}."
-    if len(alike):
-        yield (
-            f"No difference to it is shown, the interval including 0: {_list_differences(alike)}. That does not show "
-            "that there is none."
-        )
-    if len(sooner):  # a mean over censored times may rank otherwise than pairs do
-        yield f"Sooner by pairs, though later in the table: {_list_differences(sooner)}."
-    for word, rows in (
-        ("Later", unsure[unsure["difference"] > 0]),
-        ("Sooner by pairs", unsure[unsure["difference"] < 0]),
-    ):
-        if len(rows):
-            yield f"{word}, without an interval: {_list_differences(rows)}."
-
-
-def _list_differences(rows: pd.DataFrame) -> str:
-    return shorten_list([f"{row.configuration} ({_format_difference(row)})" for row in rows.itertuples(index=False)])
 
 
 def _format_difference(row: Any, unit: str = " s") -> str:

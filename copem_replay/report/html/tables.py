@@ -216,7 +216,7 @@ def regret_table(study: ReportData) -> Html:
     """Each configuration minus the baseline, as in `copem-replay compare`; or why there are no differences."""
     regret = study.regret
     if regret is None:
-        reason = "no object is measured" if study.best is None else "there is one configuration only"
+        reason = "no object is measured" if not len(study.results.known) else "there is one configuration only"
         return make_tag("p", f"No differences: {reason}.")
     rows = {(row.configuration, row.metric): row for row in regret.overall.itertuples(index=False)}
     compared = [name for name in study.ranked if name in regret.configurations]

@@ -13,6 +13,8 @@ from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from copem_replay.core.errors import InputError, unknown_name_message
 from copem_replay.metrics.columns import COMPARED_FILES
 from copem_replay.metrics.summary_metrics import COMPARED
@@ -283,15 +285,20 @@ def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str])
     return Baseline(2, fused[0], "the first that is not the truth") if fused else Baseline(2, names[0], "the first")
 
 
-def find_alone(results: Results, names: Sequence[str]) -> str:
-    """Of `names` the configuration of the car alone: with units on the ego only, a real fusion rather than an ideal
-    one; where there is none the first.
+def find_alone(results: Results, names: Sequence[str]) -> str | None:
+    """Of `names` the configuration of the car alone: units on the ego only; a real fusion rather than an ideal one.
+
+    Where no unit is on the ego it is the best with one unit. None: there is none.
     """
     experiment = results.experiment
     on_ego = {unit for unit, of in experiment.units.items() if of.on == "ego"}
     units_of = {name: set(experiment.units_of(experiment.configurations[name])) for name in names}
-    own = [name for name, units in units_of.items() if units and units <= on_ego]
-    return (*(name for name in own if not results.facts[name].by_truth_id), *own, *names)[0]
+    if on_ego:
+        own = [name for name, units in units_of.items() if units and units <= on_ego]
+        return next(iter([*(name for name in own if not results.facts[name].by_truth_id), *own]), None)
+    mean_s = results.summary.set_index("configuration")["ttd_rmst_s"].astype(float)
+    own = [name for name, units in units_of.items() if len(units) == 1 and not np.isnan(mean_s[name])]
+    return min(own, key=lambda name: mean_s[name], default=None)
 
 
 def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
