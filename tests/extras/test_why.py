@@ -37,7 +37,7 @@ def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 
 
 def test_all_parts_of_all_configurations_with_units(call) -> None:  # type: ignore[no-untyped-def]
-    code, said, notes = call("e.yaml")
+    code, said, notes = call("e.yaml", "--explain")
     assert code == 0
     assert said[-1] == "why.csv, units.csv, triage.csv, late_episodes.csv, sensitivity.csv in out/e_why"
     causes = pd.read_csv("out/e_why/why.csv")
@@ -48,6 +48,28 @@ def test_all_parts_of_all_configurations_with_units(call) -> None:  # type: igno
     assert any("PEM: expected a unit beside the ego's, found ego alone" in note for note in notes)
     head = next(line for line in said if line.startswith("coPEM: objects are unknown"))
     assert head == f"coPEM: objects are unknown for {late['added_s'].sum():.2f} s in the mean"
+
+
+def test_the_screen_has_the_seconds_of_the_tables(call) -> None:  # type: ignore[no-untyped-def]
+    """A cause that adds nothing has no column; whoever is unknown the shortest comes first."""
+    _, said, _ = call("e.yaml")
+    causes = (
+        pd.read_csv("out/e_why/why.csv").pivot(index="configuration", columns="cause", values="added_s").fillna(0.0)
+    )
+    assert len(said) <= 24
+    assert max(map(len, said)) <= 120
+    head, *rows = [re.split(r" {2,}", line.strip()) for line in said[: said.index("")]]
+    shown = {"missed in sight": "missed", "latency": "latency", "hidden": "hidden", "out of view": "range"}
+    assert head[0] == "unknown in all, s"
+    assert {shown[word] for word in head[1:]} == set(causes.columns[(causes.abs() >= 0.005).any()])
+    assert [row[0] for row in rows] == list(causes.sum(axis=1).sort_values().index)
+    for name, total, *cells in rows:
+        assert float(total) == pytest.approx(causes.loc[name].sum(), abs=0.00501)
+        for word, cell in zip(head[1:], cells, strict=True):
+            assert float(cell.replace("–", "0")) == pytest.approx(causes.loc[name, shown[word]], abs=0.00501)
+    spared = pd.read_csv("out/e_why/units.csv").set_index(["configuration", "unit"])["share_s"]["coPEM", "mast"]
+    assert f"mast spares {spared:.2f} s in coPEM." in said
+    assert said[-1].endswith("; every figure: --explain")
 
 
 def test_a_configuration_that_only_some_logs_have_is_explained_by_these(call) -> None:  # type: ignore[no-untyped-def]
@@ -176,7 +198,7 @@ def test_what_does_not_apply_is_left_out_unless_it_is_asked_for(call) -> None:  
     code, said, notes = call("e.yaml", "--configuration", "PEM")
     assert code == 0
     assert notes[-1] == "note: no units: configuration PEM: expected a unit beside the ego's, found ego alone"
-    assert "seconds unknown as PEMs vary" in said
+    assert any(line.startswith("As the PEMs vary it is unknown for 0.") for line in said)
     assert not any("pairs" in line for line in said)
     code, _, problems = call("e.yaml", "--configuration", "PEM", "--units")
     assert (code, problems[-1]) == (2, "configuration PEM: expected a unit beside the ego's, found ego alone")

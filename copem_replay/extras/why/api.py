@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 PARTS = ("causes", "units", "triage", "sensitivity")
 _SHOWN_GROUPS = 10
-_VISIBLE_S = 0.005
+VISIBLE_S = 0.005
 """Seconds that are not 0 when they are rounded to two decimals."""
 _FEW_RUNS = 50
 """With fewer runs standard errors of causes are more than about two per cent of the time unknown."""
@@ -306,9 +306,9 @@ def _describe_causes(name: str, causes: pd.DataFrame, width: int | None) -> list
 def _explain_negative(causes: pd.DataFrame) -> Iterator[str]:
     """Sentences about shares below 0."""
     of = causes.set_index("cause")
-    if "fusion" in of.index and of["added_s"]["fusion"] < -_VISIBLE_S:
+    if "fusion" in of.index and of["added_s"]["fusion"] < -VISIBLE_S:
         yield "fusion below 0: entries of a neighbour within the gate are taken for an object that no list has yet"
-    worse = [name for name in of.index[of["gained_s"] < -_VISIBLE_S] if name != "fusion"]
+    worse = [name for name in of.index[of["gained_s"] < -VISIBLE_S] if name != "fusion"]
     if worse and "queue" in of.index:
         yield f"gained_s below 0 ({', '.join(worse)}): without it lists are longer, and wait for the channel"
     elif worse:

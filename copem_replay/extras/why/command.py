@@ -32,6 +32,7 @@ def why(
     unit: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Units whose worth is asked for [all but the ego's].")
     ] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Every figure, and what it means.")] = False,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Folder of the tables [out/<experiment>_why, FOLDER/why]."),
@@ -39,11 +40,12 @@ def why(
 ) -> int:
     """Explain lateness: causes, worth of units, triage, sensitivity.
 
-    Each is a replay on the same draws without something. Without any of the four, all are computed. Of a results folder
-    the tables are put into it, and its report shows them.
+    Each is a replay on the same draws without something. Without any of the four, all are computed, and what fits a
+    screen is said. Of a results folder the tables are put into it, and its report shows them.
     """
     from copem_replay.extras.why.api import PARTS
-    from copem_replay.extras.why.api import why as explain
+    from copem_replay.extras.why.api import why as compute
+    from copem_replay.extras.why.screen import tell_explanation
 
     folder = out or Path("out") / f"{experiment.stem}_why"
     if experiment.is_dir():
@@ -53,7 +55,7 @@ def why(
         asked.append("units")
     found = show_progress(
         "explaining",
-        lambda progress: explain(
+        lambda progress: compute(
             experiment,
             configurations=configuration,
             parts=asked or None,
@@ -62,7 +64,9 @@ def why(
         ),
     )
     print_notes(found.notes)
-    print_blocks(list(found.blocks(width_of(sys.stdout))))
     written = found.save(folder)
-    print_line(f"{', '.join(path.name for path in written)} in {folder}")
+    whole = explain or bool(asked)
+    place = str(experiment) if experiment.is_dir() else "FOLDER"
+    print_blocks(list(found.blocks(width_of(sys.stdout)) if whole else tell_explanation(found, place)))
+    print_line(f"{', '.join(path.name for path in written)} in {folder}{'' if whole else '; every figure: --explain'}")
     return 0

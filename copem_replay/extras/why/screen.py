@@ -1,0 +1,103 @@
+"""Screens: what `copem-replay why` says on 80 columns and 24 lines; `--explain` has every figure and what it means."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pandas as pd
+
+from copem_replay.core.errors import count_noun
+from copem_replay.extras.why.api import VISIBLE_S, Explanation
+from copem_replay.extras.why.causes import describe_cause
+from copem_replay.extras.why.sensitivity import AS_IT_IS, describe_orders
+from copem_replay.extras.why.triage import LATE_S, describe_structure
+
+_MOST_ROWS = 12
+"""Configurations in the table; more are in `why.csv`."""
+_MOST_SPARED = 3
+"""Lines on what units spare; all are in `units.csv`."""
+_HEADERS = {"range": "out of view", "hidden": "hidden", "missed": "missed in sight"}
+"""Causes whose words are too long for a header; of others the part before a colon."""
+
+
+def tell_explanation(explained: Explanation, folder: str) -> Iterator[list[str]]:
+    """Blocks of lines. `folder`: of the results that `view` opens."""
+    if explained.causes is not None:
+        yield _tabulate_seconds(explained.causes)
+    lines: list[str] = []
+    if explained.units is not None:
+        lines += _tell_units(explained.units)
+    if explained.triage is not None and explained.causes is not None:
+        lines += _tell_late(explained.triage, folder)
+    if explained.sensitivity is not None and explained.orders is not None:
+        lines += _tell_orders(explained.sensitivity, explained.orders)
+    if lines:
+        yield lines
+
+
+def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
+    """A row for configurations with the same seconds, a column for each cause that adds any."""
+    added = causes.pivot(index="configuration", columns="cause", values="added_s")
+    added = added.reindex(index=causes["configuration"].unique(), columns=causes["cause"].unique()).fillna(0.0)
+    unknown_s = added.sum(axis=1)
+    shown = added.loc[unknown_s.sort_values(kind="stable").index, (added.abs() >= VISIBLE_S).any()]
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for name, of in shown.iterrows():
+        cells = [f"{value:.2f}" if abs(value) >= VISIBLE_S else "–" for value in of]
+        rows.setdefault((f"{unknown_s[name] + 0.0:.2f}", *cells), []).append(str(name))
+    heads = [_HEADERS.get(str(cause), describe_cause(str(cause)).partition(":")[0]) for cause in shown]
+    kept = [*rows.items()][:_MOST_ROWS]
+    table = [["", "unknown in all, s", *heads], *([_join_names(names), *cells] for cells, names in kept)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = [
+        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
+        for row in table
+    ]
+    left = sum(len(names) for names in [*rows.values()][_MOST_ROWS:])
+    return [line.rstrip() for line in lines] + ([f"and {left} more in why.csv"] if left else [])
+
+
+def _join_names(names: list[str]) -> str:
+    return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _tell_units(units: pd.DataFrame) -> list[str]:
+    """What units spare beside those that are given, the most first; what is alike stands together."""
+    most = units.groupby("unit")["share_s"].max().sort_values(ascending=False, kind="stable")
+    alike: dict[str, list[str]] = {}
+    for unit in most.index:
+        by_words: dict[str, list[str]] = {}
+        for row in units[units["unit"] == unit].itertuples(index=False):
+            by_words.setdefault(f"{row.share_s + 0.0:.2f} s", []).append(str(row.configuration))
+        told = ", ".join(f"{words} in {_join_names(of)}" for words, of in by_words.items())
+        alike.setdefault(told, []).append(str(unit))
+    shown = [f"{_join_names(of)} spare{'s' * (len(of) == 1)} {told}." for told, of in [*alike.items()][:_MOST_SPARED]]
+    return [*shown, *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
+
+
+def _tell_late(groups: pd.DataFrame, folder: str) -> list[str]:
+    """The group of late episodes that costs most, and how to look at one."""
+    if not len(groups):
+        return [f"Nothing is unknown for more than {LATE_S:g} s in one run of twenty or more."]
+    worst = groups.loc[groups["lost_s"].idxmax()]
+    where = f" ({worst['where']})" if worst["where"] else ""
+    told = f"{worst['example_class']} {worst['example']}"
+    if int(worst["objects"]) > 1:
+        told = f"{count_noun(int(worst['objects']), 'object')} such as {told}"
+    how = describe_structure(float(worst["structural_share"]))
+    return [
+        f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {told}: "
+        f"{describe_cause(str(worst['cause']))}{where}{how}.",
+        f"    copem-replay view {folder} --object {worst['example']} --log {worst['log']}",
+    ]
+
+
+def _tell_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
+    """Whether configurations keep their order as the models vary; of one, for how long it is unknown then."""
+    variations = [name for name in varied["variation"].unique() if name != AS_IT_IS]
+    if varied["configuration"].nunique() < 2:
+        means_s = varied.groupby("variation")["unknown_s"].mean()
+        return [f"As the PEMs vary it is unknown for {means_s.min():.2f} to {means_s.max():.2f} s."]
+    if not orders["beyond"].any():
+        return [f"The order of configurations stays with {', '.join(variations)}."]
+    return describe_orders(varied, orders)
