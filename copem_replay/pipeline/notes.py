@@ -505,9 +505,20 @@ def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
             measured = alone.model_copy(update={"measure": measure})
             same = one == alone.measure.onset
             total += (replay.episodes if same else replay.find_episodes_of(measured)).count_began()
-        chosen = "; chosen" if one == onset and len(asked) > 1 else ""
-        lines.append(f"{label}: {describe_numbers(total.tolist())}{chosen}")
-    return [f"objects by how they began, {line}" for line in lines]
+        chosen = " (chosen)" if one == onset and len(asked) > 1 else ""
+        lines.append(f"{label}: {_describe_counted(total.tolist(), experiment.measure.began)}{chosen}")
+    return lines
+
+
+def _describe_counted(numbers: Sequence[int], words: Sequence[str]) -> str:
+    """`18 objects count: 14 crossed, 4 appeared; not 1 log_start`."""
+    counted = count_counted(numbers, words)
+    told: tuple[list[str], list[str]] = [], []
+    for word, number in zip(BEGAN, numbers, strict=True):
+        if number:
+            told[word not in words].append(f"{number} {word}")
+    of, left = (", ".join(part) for part in told)
+    return f"{count_noun(counted, 'object')} count{'s' * (counted == 1)}{of and f': {of}'}{left and f'; not {left}'}"
 
 
 # Facts of a log, and its scene, as plain data.

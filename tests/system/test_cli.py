@@ -349,12 +349,12 @@ class TestInfo:
 
 
 BEGAN = (
-    "objects by how they began, within 30 m: 0 log_start, 0 appeared, 0 crossed\n"
-    "objects by how they began, within 40 m: 0 log_start, 0 appeared, 1 crossed\n"
-    "objects by how they began, within 50 m: 0 log_start, 0 appeared, 1 crossed\n"
-    "objects by how they began, within 60 m: 0 log_start, 0 appeared, 1 crossed; chosen\n"
+    "within 30 m: 0 objects count\n"
+    "within 40 m: 1 object counts: 1 crossed\n"
+    "within 50 m: 1 object counts: 1 crossed\n"
+    "within 60 m: 1 object counts: 1 crossed (chosen)\n"
 )
-BEGAN_OF_TWO = BEGAN.replace("1 crossed", "2 crossed")
+BEGAN_OF_TWO = BEGAN.replace("1 object counts: 1", "2 objects count: 2")
 
 
 class TestCheck:
