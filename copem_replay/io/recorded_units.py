@@ -73,16 +73,16 @@ def describe_oddities(lists: RecordedLists, object_ix: Int, scene: Scene) -> Ite
     backwards = backwards_share(lists)
     if backwards is not None and backwards > MANY:
         yield (
-            f"its velocities point against the way its own tracks move ({backwards:.0%} of its entries); a fusion that "
-            "uses velocities (`tracker` with `late: predict`, new tracks) will put objects in wrong places"
+            f"in {backwards:.0%} of its entries the velocity points backwards, against the way its own tracks move; a "
+            "fusion that uses velocities (`tracker` with `late: predict`, new tracks) will put objects in wrong places"
         )
     yield from _changing_ids(lists, object_ix, scene)
     count = len(object_ix)
     unknown = int((object_ix < 0).sum())
     if count and unknown > MANY * count:
         yield (
-            f"{unknown} of {count_noun(count, 'entry', 'entries')} are about no object of the truth: others that it "
-            "does not have, or false ones; both count as false positives"
+            f"{unknown} of {count_noun(count, 'entry', 'entries')} match nothing in the truth (not labelled, or false);"
+            " all count as false positives"
         )
 
 

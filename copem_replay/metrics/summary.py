@@ -158,7 +158,7 @@ def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[s
     if followed >= needed:
         return asked_s, []
     words, shorter = _format_followed(number, followed, asked_s), format_cell(shorter_s)
-    return shorter_s, [f"horizon_s: {words}; means are of min(time, {shorter} s), which {needed} of them last"]
+    return shorter_s, [f"horizon_s: {words}; so times count up to {shorter} s, which {needed} of them last"]
 
 
 def describe_followed(counted: pd.DataFrame, horizon_s: float) -> str | None:

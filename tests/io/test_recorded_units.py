@@ -206,7 +206,7 @@ class TestWhatIsSaid:
         """Of a track that moves 0.8 m per list, or whose place jitters by a few centimetres."""
         places = [30 + (jitter_m * (k % 2) if jitter_m else 0.8 * k) for k in range(10)]
         path = drive(tmp_path / "a.mcap", *(list_of(0.1 * k, car(x, vx=vx, track=3)) for k, x in enumerate(places)))
-        notes = [note for note in read(path).notes if "point against the way its own tracks move (100% of" in note]
+        notes = [note for note in read(path).notes if "in 100% of its entries the velocity points backwards" in note]
         assert len(notes) == said
 
     def test_what_cannot_be_read(self, tmp_path: Path) -> None:

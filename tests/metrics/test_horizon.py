@@ -33,19 +33,19 @@ def rows(lengths_s: Sequence[float]) -> pd.DataFrame:
     ("lengths_s", "asked_s", "expected_s", "note"),
     [
         ([5.0], 5.0, 5.0, None),  # the paper's: 1.1 + 5.0 − 1.1 is less than 5 by rounding
-        ([4.0], 5.0, 4.0, "0 of 1 episode that count (0 %) last 5 s; means are of min(time, 4 s), which 1 "
+        ([4.0], 5.0, 4.0, "0 of 1 episode that count (0 %) last 5 s; so times count up to 4 s, which 1 "
          "of them last"),
         ([9.0, 3.0], 5.0, 5.0, None),  # half of two
-        ([9.0, 3.0, 2.0], 5.0, 3.0, "1 of 3 episodes that count (33.3 %) last 5 s; means are of min(time, 3 s), which "
+        ([9.0, 3.0, 2.0], 5.0, 3.0, "1 of 3 episodes that count (33.3 %) last 5 s; so times count up to 3 s, which "
          "2 of them last"),
         ([9.0, 8.0, 1.0, 1.0], 5.0, 5.0, None),
-        ([9.0, 8.0, 7.0, 6.0, 2.0], 5.0, 2.0, "4 of 5 episodes that count (80 %) last 5 s; means are of min(time, "
-         "2 s), which 5 of them last"),
+        ([9.0, 8.0, 7.0, 6.0, 2.0], 5.0, 2.0, "4 of 5 episodes that count (80 %) last 5 s; so times count up to "
+         "2 s, which 5 of them last"),
         ([9.0] * 5 + [1.0] * 45, 5.0, 5.0, None),  # five, and a tenth of fifty
-        ([9.0] * 5 + [1.0] * 46, 5.0, 1.0, "5 of 51 episodes that count (9.8 %) last 5 s; means are of min(time, 1 s), "
+        ([9.0] * 5 + [1.0] * 46, 5.0, 1.0, "5 of 51 episodes that count (9.8 %) last 5 s; so times count up to 1 s, "
          "which 6 of them last"),
         ([9.0] * 6 + [1.0] * 54, 8.5, 8.5, None),
-        ([9.0] * 8, 100.0, 9.0, "0 of 8 episodes that count (0 %) last 100 s; means are of min(time, 9 s), which 5 of "
+        ([9.0] * 8, 100.0, 9.0, "0 of 8 episodes that count (0 %) last 100 s; so times count up to 9 s, which 5 of "
          "them last"),
         ([], 5.0, 5.0, None),
     ],

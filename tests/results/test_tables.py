@@ -246,8 +246,7 @@ def test_what_the_table_shows_is_said_below(tmp_path):
         "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
         "drives",
         "detected_share: exact binomial limits where the difference is the same in every cluster",
-        "(all alike): the difference is the same in every cluster, or a median in nearly all, so how it varies is "
-        "not known",
+        "(all alike): no interval, the difference is the same in every cluster (of a median in nearly all)",
         "ttd_rmst_s: mean of min(time to detection, 10 s), never detected counting as 10 s; an object still undetected "
         "when the log or the ego ends counts as those that are followed longer",
     ]

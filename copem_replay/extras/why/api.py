@@ -298,8 +298,10 @@ def _describe_causes(name: str, causes: pd.DataFrame, width: int | None) -> list
     })  # fmt: skip
     lines = [f"{name}: objects are unknown for {total_s:.2f} s in the mean", *format_table(shown, width).splitlines()]
     if total_s > 0:
-        sums = f"they sum to {overlap_s / total_s:.2f} times the whole" if overlap_s > 0 else "they do not sum"
-        lines.append(f"added_s sums to the whole; gained_s is what is won if only that cause were gone: {sums}")
+        lines.append(
+            f"added_s: shares, they sum to {total_s:.2f} s; gained_s: what you win by removing this cause alone "
+            f"(causes overlap, so these sum to {overlap_s:.2f} s)"
+        )
     return [*lines, *_explain_negative(causes)]
 
 
@@ -317,7 +319,7 @@ def _explain_negative(causes: pd.DataFrame) -> Iterator[str]:
 
 def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[str]:
     shown = units.drop(columns="configuration").reset_index(drop=True)
-    head = f"{name}: seconds that each unit spares, beside the units that are given"
+    head = f"{name}: seconds that each unit saves, beside the units that are given"
     return [head, *format_table(shown, width).splitlines()]
 
 

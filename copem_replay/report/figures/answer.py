@@ -188,7 +188,7 @@ def _note_sentences(results: Results, names: Sequence[str], rows: pd.DataFrame, 
     sentences = [describe_results(results, names)]
     if intervals:
         sentences.append(f"Lines: 95 % intervals over {describe_over(results)}")
-        sentences.append("Two that overlap may differ for sure: see the differences")
+        sentences.append("Lines that overlap can still differ clearly: see Differences")
     horizon = rows["ttd_rmst_horizon_s"].dropna()
     if len(horizon):
         up_to = f"{format_three_digits(float(horizon.iloc[0]))} s"

@@ -127,13 +127,13 @@ def _format_cells(comparison: Comparison) -> pd.DataFrame:
 
 
 def format_alone(comparison: Comparison, configuration: str) -> str:
-    """What `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)` of the rows; empty: not compared."""
+    """What `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)` of the rows; empty: nothing."""
     of_pair = comparison.overall[comparison.overall["configuration"] == configuration].set_index("metric")
     if not {"ttd_both_s", "detected_share"} <= set(of_pair.index) or not of_pair.loc["detected_share", "n"]:
         return ""
     row, rows = of_pair.loc["ttd_both_s"], int(of_pair.loc["detected_share", "n"])
-    shares = (100 * row[name] / rows for name in ("only_configuration", "only_baseline"))
-    return "(only it {:.3g} %, only the baseline {:.3g} %)".format(*shares)
+    shares = [100 * row[name] / rows for name in ("only_configuration", "only_baseline")]
+    return "(only it {:.3g} %, only the baseline {:.3g} %)".format(*shares) if any(shares) else ""
 
 
 def _format_cell(row: Any) -> str:
@@ -250,14 +250,13 @@ def _describe_held(comparison: Comparison) -> Iterator[str]:
     if not len(held_cells(comparison)):
         return
     yield (
-        "position_rmse_held_m: RMSE of the newest list available at each frame, as it stands, against the truth then, "
-        "over pairs of object and frame that both list; a difference: what is held may be nearer to the truth than the "
-        f"list of {comparison.baseline}"
+        "position_rmse_held_m: position error (RMSE) of the newest list at each frame, over objects that both list; "
+        f"negative is better than {comparison.baseline}"
     )
     yield (
-        f"listed by one only, mean age of the entries in pairs, no list at a share of the frames, no truth: of the "
-        f"configuration / of {comparison.baseline}. No list: the newest is older than max_age_s; such frames count in "
-        "gospa_held_m. No truth: entries whose object has none at the frame, which are in no error"
+        f"of the configuration / of {comparison.baseline}: entries of one only; mean age of the entries in pairs; "
+        "share of the frames without a list, as the newest is older than max_age_s (these count in gospa_held_m); "
+        "entries whose object has no truth at the frame (in no error)"
     )
 
 
@@ -300,8 +299,8 @@ def _describe_intervals(overall: pd.DataFrame) -> Iterator[str]:
         yield f"{', '.join(kinds[EXACT])}: exact binomial limits where the difference is the same in every cluster"
     if ALL_ALIKE in kinds:
         yield (
-            f"({_WITHOUT[ALL_ALIKE]}): the difference is the same in every cluster, or a median in nearly all, so how "
-            "it varies is not known"
+            f"({_WITHOUT[ALL_ALIKE]}): no interval, the difference is the same in every cluster (of a median in "
+            "nearly all)"
         )
     if NOTHING_DRAWN in kinds:
         yield f"({_WITHOUT[NOTHING_DRAWN]}): every run is the same, so an interval over runs has no meaning"
