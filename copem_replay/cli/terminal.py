@@ -122,17 +122,21 @@ def print_table(text: str, bold: Collection[str] = ()) -> None:
         print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line.split("  ")[0] in bold else fitted)
 
 
+_PIPED = 120
+"""Characters per line of a screen in files and pipes."""
+
+
 def print_rows(lines: Iterable[str], bold: Collection[str] = ()) -> None:
-    """Print lines on stdout; in a terminal, those in `bold` are bold."""
+    """Print lines of a screen on stdout; in a terminal, those in `bold` are bold."""
     width = width_of(sys.stdout)
     for line in lines:
-        fitted = _fit_line(line, width)
+        fitted = _fit_line(line, width or _PIPED)
         print(f"\x1b[1m{fitted}\x1b[0m" if width is not None and line in bold else fitted)
 
 
 def print_answer(sentences: Sequence[str]) -> None:
     """Print the answer, the last paragraph of a command, each sentence on lines of its own."""
-    print_blocks([["", *sentences]])
+    print_rows(["", *sentences])
 
 
 def print_problems(lines: Iterable[str]) -> None:

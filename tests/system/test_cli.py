@@ -486,7 +486,7 @@ class TestCheck:
         assert ended == (0, f"{BEGAN}../e.yaml: no problem found; logs: drive\n", [])
 
 
-END = r"\nresults in out/e; every figure: --explain\nnext: copem-replay report out/e\n\n[A-Z].*\.\n$"
+END = r"\nresults in out/e; every figure: --explain\nnext: copem-replay report out/e\n\n[A-Z][^\n]*(\n +[^\n]*)*\.\n$"
 
 
 class TestRun:

@@ -13,6 +13,7 @@ from copem_replay.cli.terminal import (
     print_blocks,
     print_line,
     print_notes,
+    print_rows,
     show_progress,
     split_names,
     width_of,
@@ -67,6 +68,9 @@ def why(
     written = found.save(folder)
     whole = explain or bool(asked)
     place = str(experiment) if experiment.is_dir() else "FOLDER"
-    print_blocks(list(found.blocks(width_of(sys.stdout)) if whole else tell_explanation(found, place)))
+    if whole:
+        print_blocks(list(found.blocks(width_of(sys.stdout))))
+    else:
+        print_rows(tell_explanation(found, place))
     print_line(f"{', '.join(path.name for path in written)} in {folder}{'' if whole else '; every figure: --explain'}")
     return 0

@@ -20,19 +20,16 @@ _HEADERS = {"range": "out of view", "hidden": "hidden", "missed": "missed in sig
 """Causes whose words are too long for a header; of others the part before a colon."""
 
 
-def tell_explanation(explained: Explanation, folder: str) -> Iterator[list[str]]:
-    """Blocks of lines. `folder`: of the results that `view` opens."""
+def tell_explanation(explained: Explanation, folder: str) -> Iterator[str]:
+    """Lines. `folder`: of the results that `view` opens."""
     if explained.causes is not None:
-        yield _tabulate_seconds(explained.causes)
-    lines: list[str] = []
+        yield from [*_tabulate_seconds(explained.causes), ""]
     if explained.units is not None:
-        lines += _tell_units(explained.units)
+        yield from _tell_units(explained.units)
     if explained.triage is not None and explained.causes is not None:
-        lines += _tell_late(explained.triage, folder)
+        yield from _tell_late(explained.triage, folder)
     if explained.sensitivity is not None and explained.orders is not None:
-        lines += _tell_orders(explained.sensitivity, explained.orders)
-    if lines:
-        yield lines
+        yield from _tell_orders(explained.sensitivity, explained.orders)
 
 
 def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
