@@ -193,8 +193,10 @@ def decide_compared(
     The ground truth is no choice.
     """
     scale, pairs = _judge_pairs(comparison)
-    if not pairs or comparison.baseline in comparison.truths:
-        return Decision((f"There is no answer: nothing can be held against {comparison.baseline}.",))
+    if comparison.baseline in comparison.truths:
+        return Decision((f"There is no answer: nothing can be held against {comparison.baseline}, the truth.",))
+    if not pairs:
+        return Decision((f"There is no answer: no log has both {comparison.baseline} and another configuration.",))
     brakers, needless = _tell_needless(comparison, summary)
     gains = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
     gains = {name: gain for name, gain in gains.items() if name not in brakers}
@@ -328,9 +330,10 @@ def _tell_parts(results: Results, comparison: Comparison, names: Sequence[str]) 
     pairs = _hold_against(results, dict.fromkeys(shown, alone), scale)
     latencies = _tell_latencies(alone, pairs, scale, experiment)
     if pairs:
-        yield (
-            f"{latencies}." if latencies else f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}."
-        )
+        told = latencies or f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}"
+        yield f"{told}."
+    elif shown:
+        yield f"Cooperation: not known, for no log has both {alone} and {' or '.join(shown[:_NAMED])}."
     if ideals and (fused := _hold_against(results, ideals, scale)):
         [*against] = {*ideals.values()}
         told = _tell_groups(against[0] if len(against) == 1 else _IDEAL, fused, scale, brakers)

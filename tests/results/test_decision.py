@@ -290,6 +290,20 @@ class TestParts:
         )
 
 
+def test_where_no_log_has_both_there_is_no_answer(tmp_path: Path) -> None:
+    approached(tmp_path, car="[ego]")
+    logs = "[{file: drive.mcap, name: a, units: {mast: null}}, {file: drive.mcap, name: b, units: {ego: null}, %s}]"
+    logs %= "measure: {distance_to: mast}, window_s: [0, 4]"
+    for more, told in (
+        ("", "There is no answer: no log has both car and another configuration."),
+        (", ideal: {units: [mast]}, gnn: {units: [mast], fusion: {kind: gnn}}",
+         "Cooperation: not known, for no log has both car and ideal or gnn."),
+    ):  # fmt: skip
+        text = APPROACH % f"car: {{units: [ego]}}, tower: {{units: [mast]}}{more}"
+        (tmp_path / "two.yaml").write_text(text.replace("[drive.mcap]", logs))
+        assert decide(cr.run(tmp_path / "two.yaml", jobs=1)).sentences[0] == told
+
+
 def test_criteria_are_the_sentence() -> None:
     def said(*words: str) -> str:
         return describe_verdicts(Judgement("r", tuple(verdict(f"v{k}", word) for k, word in enumerate(words))))
