@@ -262,7 +262,11 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
     """
     better, worse = ("Better", "Worse") if scale.is_share else ("Sooner", "Later")
     bases = [pair.base for pair in pairs.values()]
-    held = f"{baseline} ({scale.say(bases[0])})" if max(bases) - min(bases) <= NOTHING else baseline
+    held = (
+        f"{baseline} ({scale.say(bases[0]).removeprefix('an object is ')})"
+        if max(bases) - min(bases) <= NOTHING
+        else baseline
+    )
     heads = {
         BETTER: f"{better} than {{}}: ",
         _AT_A_PRICE: f"{better} than {{}}, but braking for nothing: ",

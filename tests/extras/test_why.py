@@ -68,7 +68,7 @@ def test_the_screen_has_the_seconds_of_the_tables(call) -> None:  # type: ignore
         for word, cell in zip(head[1:], cells, strict=True):
             assert float(cell.replace("–", "0")) == pytest.approx(causes.loc[name, shown[word]], abs=0.00501)
     spared = pd.read_csv("out/e_why/units.csv").set_index(["configuration", "unit"])["share_s"]["coPEM", "mast"]
-    assert f"mast spares {spared:.2f} s in coPEM." in said
+    assert f"mast saves {spared:.2f} s in coPEM." in said
     assert said[-1].endswith("; every figure: --explain")
 
 

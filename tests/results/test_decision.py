@@ -82,7 +82,7 @@ class TestLatencies:
             cooperating(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
-            "Sooner than PEM (an object is known after 0.70 s on average): co1 by 0.60 s [0.50, 0.70]; later than PEM: "
+            "Sooner than PEM (known after 0.70 s on average): co1 by 0.60 s [0.50, 0.70]; later than PEM: "
             "co0 by 0.20 s [0.10, 0.30]."
         )
 
@@ -109,13 +109,13 @@ class TestGroups:
     def test_nobody_is_crowned_by_a_hair(self, apart_s: float, crowned: bool) -> None:
         """All intervals exclude 0."""
         found = decide_compared(compared("ttd_rmst_s", ("a", 1 - apart_s, 1.0, -apart_s - 1e-5, -apart_s + 1e-5)))
-        assert found.sentence.startswith("Sooner than PEM" if crowned else "Apart from PEM (an object is known")
+        assert found.sentence.startswith("Sooner than PEM" if crowned else "Apart from PEM (known")
         assert found.best == (("a",) if crowned else ("a", "PEM"))
 
     def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 0.5, 1.0, -1.2, 0.2), ("b", 2.0, 1.0, 0.5, 1.5)))
         assert found.sentence == (
-            "Later than PEM (an object is known after 1.00 s on average): b by 1.00 s [0.50, 1.50]; no difference to "
+            "Later than PEM (known after 1.00 s on average): b by 1.00 s [0.50, 1.50]; no difference to "
             "PEM is shown: a 0.50 s sooner [-0.20, 1.20]."
         )
         assert set(found.best) == {"a", "PEM"}
@@ -136,7 +136,7 @@ class TestGroups:
     def test_who_is_the_same_in_every_pair_is_said_to_be(self) -> None:
         found = decide_compared(compared("ttd_rmst_s", ("a", 1.0, 1.0, None, None), ("b", 1.0, 1.0, -0.1, 0.1)))
         assert found.sentence == (
-            "The same as PEM (an object is known after 1.00 s on average): a; no difference to PEM is shown: b 0.00 s "
+            "The same as PEM (known after 1.00 s on average): a; no difference to PEM is shown: b 0.00 s "
             "sooner [-0.10, 0.10]."
         )
 
@@ -175,7 +175,7 @@ class TestBrakingForNothing:
     def test_who_brakes_for_nothing_is_sooner_at_a_price(self) -> None:
         assert self.decided(("a", 0.25, 0.0, 0.2, 0.3), ("b", 0.0, 0.0, 0.0, 0.0)) == Decision(
             (
-                "Sooner than PEM (an object is known after 1.00 s on average): b by 0.30 s [0.20, 0.40]; sooner than "
+                "Sooner than PEM (known after 1.00 s on average): b by 0.30 s [0.20, 0.40]; sooner than "
                 "PEM, but braking for nothing: a by 0.50 s [0.40, 0.60].",
                 "But with a the driver brakes for nothing in 25 % of the driving time (PEM: never).",
             ),
@@ -185,7 +185,7 @@ class TestBrakingForNothing:
     def test_where_the_baseline_does_the_others_are_held_against_the_best_of_them(self) -> None:
         found = self.decided(("a", 0.0, 0.25, -0.3, -0.2), ("b", 0.25, 0.25, -0.01, 0.01))
         assert found.best == ("a",)
-        assert found.sentence.startswith("Sooner than PEM (an object is known after 1.00 s on average): a by 0.50 s")
+        assert found.sentence.startswith("Sooner than PEM (known after 1.00 s on average): a by 0.50 s")
         assert "; sooner than PEM, but braking for nothing: b by 0.30 s" in found.sentence
         assert (
             "But with b the driver brakes for nothing in 25 % of the driving time, with PEM in 25 %" in found.sentence
@@ -248,25 +248,25 @@ class TestParts:
             late="[ego, mast], fusion: {kind: gnn}, latency_s: 0.5",
         )
         assert re.fullmatch(
-            r"Cooperation: sooner than alone \(an object is known after 2\.70 s on average\): gnn by 2\.70 s "
+            r"Cooperation: sooner than alone \(known after 2\.70 s on average\): gnn by 2\.70 s "
             r"\[2\.\d\d, 3\.\d\d\], late by 2\.20 s \[1\.\d\d, 2\.\d\d\]\.",
             cooperation,
         )
-        assert fusion == "Fusion: the same as ideal (an object is known after 0.00 s on average): gnn."
+        assert fusion == "Fusion: the same as ideal (known after 0.00 s on average): gnn."
         assert latency == "Latency: 0.5 s costs 0.50 s, alike in every pair (late against gnn)."
 
     def test_an_ideal_whose_lists_nobody_else_has_is_cooperation(self, tmp_path: Path) -> None:
         [cooperation] = approached(tmp_path, car="[ego]", both="[ego, mast]")
-        assert cooperation.startswith("Cooperation: sooner than car (an object is known after 2.70 s on average): both")
+        assert cooperation.startswith("Cooperation: sooner than car (known after 2.70 s on average): both")
 
     def test_who_is_neither_stands_beside_them(self, tmp_path: Path) -> None:
         """Another sensor of the car is no cooperation."""
         _, beside = approached(tmp_path, car="[ego]", better="[ego, more]", both="[ego, mast]")
-        assert beside.startswith("Beside them: sooner than car (an object is known after 2.70 s on average): better by")
+        assert beside.startswith("Beside them: sooner than car (known after 2.70 s on average): better by")
 
     def test_of_the_car_alone_there_are_no_parts(self, tmp_path: Path) -> None:
         [told] = approached(tmp_path, car="[ego]", better="[ego, more]")
-        assert told.startswith("Sooner than car (an object is known after 2.70 s on average): better by 2.70 s [")
+        assert told.startswith("Sooner than car (known after 2.70 s on average): better by 2.70 s [")
 
     def test_latencies_between_which_the_help_ends_are_the_sentence(self, tmp_path: Path) -> None:
         [told] = approached(tmp_path, car="[ego]", at_once="[ego, mast]", late="[ego, mast], latency_s: 2.9")
@@ -285,8 +285,8 @@ class TestParts:
         approached(tmp_path, car="[ego]")
         found = decide(cr.run(plain, jobs=1)).sentences
         assert found == (
-            "Cooperation: the same as mast (an object is known after 0.00 s on average): both.",
-            "Beside them: later than mast (an object is known after 0.00 s on average): other by 2.70 s [2.14, 3.00].",
+            "Cooperation: the same as mast (known after 0.00 s on average): both.",
+            "Beside them: later than mast (known after 0.00 s on average): other by 2.70 s [2.14, 3.00].",
         )
 
 

@@ -68,7 +68,7 @@ def _tell_units(units: pd.DataFrame) -> list[str]:
             by_words.setdefault(f"{row.share_s + 0.0:.2f} s", []).append(str(row.configuration))
         told = ", ".join(f"{words} in {_join_names(of)}" for words, of in by_words.items())
         alike.setdefault(told, []).append(str(unit))
-    shown = [f"{_join_names(of)} spare{'s' * (len(of) == 1)} {told}." for told, of in [*alike.items()][:_MOST_SPARED]]
+    shown = [f"{_join_names(of)} save{'s' * (len(of) == 1)} {told}." for told, of in [*alike.items()][:_MOST_SPARED]]
     return [*shown, *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
 
 
