@@ -27,6 +27,7 @@ from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.episodes import Episodes, Reference, locate_reference
 from copem_replay.metrics.onset import began_texts
+from copem_replay.metrics.sight import SightTimes
 from copem_replay.metrics.survival import end_reason_texts
 from copem_replay.perception.visibility import rectangle_corners
 
@@ -130,14 +131,13 @@ T = TypeVar("T", bound=np.generic)
 class DetectionEvents:
     """Detections of one configuration, run by run: (S, M), or (1, M) where all runs agree.
 
-    `units`: names of the units that `detections` counts. `in_sight_s`: when any of its units had the object in sight,
-    NaN: never, or not known. `conflict_known_s`: when a list first implied a collision, NaN: never. `way`: None where
-    the configuration has neither a link nor units with `ready` or `sends`.
+    `units`: names of the units that `detections` counts. `conflict_known_s`: when a list first implied a collision,
+    NaN: never. `way`: None where the configuration has neither a link nor units with `ready` or `sends`.
     """
 
     units: tuple[str, ...]
     detections: FirstDetections
-    in_sight_s: Float
+    sight: SightTimes
     conflict_known_s: Float | None = None
     way: Way | None = None
 
@@ -229,7 +229,7 @@ def _configuration_columns(
         "detected": ~np.isnan(detection_s),
         "detection_s": detection_s,
         "captured_s": flat(detections.captured_s),
-        "in_sight_s": flat(event.in_sight_s),
+        **{name: flat(values) for name, values in event.sight._asdict().items()},
         "time_to_detection_s": detection_s - onset_s,
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,

@@ -25,7 +25,6 @@ from copem_replay.metrics.config import Measure, MetricsSetup
 from copem_replay.metrics.onset import APPEARED, BEGAN, CROSSED, LOG_START, OnsetView, evaluate_onset
 from copem_replay.metrics.survival import END_REASONS, EndReason
 from copem_replay.perception.config import Carriers
-from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import (
     compute_unit_poses,
     find_carrier,
@@ -338,30 +337,3 @@ def _find_best_share(
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
     return best
-
-
-def first_sights(observations: Observations, episodes: Episodes) -> Float:
-    """(U, M) capture of each modelled unit's first list of an episode that has the object in sight; inf: none."""
-    tracks, episode = observations.tracks, episodes.number_rows(observations.tracks)
-    rows = np.flatnonzero((episode >= 0) & (observations.view.visible_share > 0))
-    first_s = np.full((len(tracks.units), len(episodes.object_ix)), np.inf)
-    np.minimum.at(first_s, (tracks.row_unit_ix[rows], episode[rows]), tracks.row_captured_s[rows])
-    return first_s
-
-
-def earliest_sight_s(first_s: Float, experiment: MetricsSetup, names: Sequence[str], equipped: Bool | None) -> Float:
-    """(S | 1, M) the first instant at which any of the units `names` has the object of each episode in sight.
-
-    NaN: never, or not known (for the truth, and with recorded units). `first_s` as from `first_sights`; `equipped (S,
-    U)`: which of the experiment's units each run has, None: all.
-    """
-    unknown = np.full((1, first_s.shape[1]), np.nan)
-    if not names or any(name in experiment.recorded for name in names):
-        return unknown
-    modelled, all_units = list(experiment.modelled), list(experiment.units)
-    unit_s = first_s[None, [modelled.index(name) for name in names]]
-    if equipped is not None:
-        present = equipped[:, [all_units.index(name) for name in names]]
-        unit_s = np.where(present[:, :, None], unit_s, np.inf)
-    seen_s = unit_s.min(axis=1)
-    return np.where(np.isfinite(seen_s), seen_s, np.nan)

@@ -47,10 +47,10 @@ from copem_replay.metrics.episodes import (
     Episodes,
     Reference,
     find_episodes,
-    first_sights,
     locate_reference,
     measured_objects,
 )
+from copem_replay.metrics.sight import SightSpans, find_sight_changes, join_sight_changes
 from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment
@@ -233,8 +233,8 @@ class Replay:
         return _find_kept_episodes(self.scene, self.truth, self.placed, experiment)[0]
 
     @property
-    def first_sights_s(self) -> Float:
-        """(U, M) when each modelled unit first has each episode in sight; inf: never."""
+    def sight_spans(self) -> SightSpans:
+        """What each modelled unit has of each episode, from list to list."""
         return self._overview[0]
 
     @property
@@ -243,15 +243,15 @@ class Replay:
         return self._overview[1]
 
     @cached_property
-    def _overview(self) -> tuple[Float, Bool, int]:
-        """`first_sights_s`, `ever_met`, and the number of observation rows of objects that have an episode."""
-        sights, met, rows = list[Float](), list[Bool](), 0
+    def _overview(self) -> tuple[SightSpans, Bool, int]:
+        """`sight_spans`, `ever_met`, and the number of observation rows of objects that have an episode."""
+        changes, met, rows = [], list[Bool](), 0
         for chunk in self.chunks:
             observations = self.observe(chunk)
-            sights.append(first_sights(observations, self.episodes))
+            changes.append(find_sight_changes(observations, self.expanded, self.scene.tags, self.episodes))
             met.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
-        return np.min(sights, axis=0), np.any(met, axis=0), rows
+        return join_sight_changes(changes, self.episodes), np.any(met, axis=0), rows
 
     @cached_property
     def truth_cache(self) -> TruthCache:

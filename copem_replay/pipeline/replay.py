@@ -26,7 +26,7 @@ from copem_replay.metrics.detections_table import (
     pick_list_times,
     stack_events,
 )
-from copem_replay.metrics.episodes import earliest_sight_s
+from copem_replay.metrics.sight import measure_sight
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.pipeline.receiver import Receivers, states_needed
@@ -209,13 +209,13 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
         received, log.episodes, confirm=measure.confirm, count_earlier=measure.count_earlier,
         max_age_s=configuration.max_age_s,
     )  # fmt: skip
-    in_sight_s = earliest_sight_s(log.first_sights_s, units, names, lists.group.listing)
-    way = None
+    listed_s, way = detections.captured_s, None
+    if units.has_way(name) or known is not None or measure.confirm.of > 1:
+        listed_s = first_listed_s(listed, log.episodes, names or (TRUTH,), count_earlier=measure.count_earlier)
     if units.has_way(name):
         informing = find_informing_list(received, detections)
-        way = Way(
-            first_listed_s(listed, log.episodes, names or (TRUTH,), count_earlier=measure.count_earlier),
-            pick_list_times(informing, made.common_arrives_s),
-            pick_list_times(informing, lists.arriving(name).common_arrives_s),
-        )
-    return DetectionEvents(received.units, detections, in_sight_s, way=way)
+        arriving = lists.arriving(name).common_arrives_s
+        way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (made.common_arrives_s, arriving)))
+    until_s = np.fmin(np.fmin(listed_s, detections.captured_s), log.episodes.ended_s)
+    sight = measure_sight(log.sight_spans, units, names, lists.group.listing, until_s)
+    return DetectionEvents(received.units, detections, sight, way=way)

@@ -17,7 +17,6 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +26,7 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.sight import Sight, name_bodies
 from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
@@ -41,16 +41,13 @@ from copem_replay.viewer.sink import (
     lane_path,
     make_distinct,
     plain_part,
+    short_ids,
     show_seconds,
     status_colour,
     to_nanoseconds,
 )
 from copem_replay.viewer.sink import LOST as LIST_LOST
-from copem_replay.viewer.status import EpisodeClocks, Status, lane_text, name_bodies
-
-if TYPE_CHECKING:
-    from copem_replay.viewer.line_of_sight import Sight
-
+from copem_replay.viewer.status import EpisodeClocks, Status, lane_text
 
 STEADY_S = 0.4
 """Shorter spans become part of those around them: their words could not be read."""
@@ -88,7 +85,7 @@ def write_lanes(
     """
     import rerun as rr
 
-    bodies, units = name_bodies(scene, sight.solids), [*experiment.units, TRUTH]
+    bodies, units = name_bodies(scene, sight.solids, short_ids(scene)), [*experiment.units, TRUTH]
     for m, k in enumerate(sight.object_ix.tolist()):
         axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
@@ -198,7 +195,8 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
 def _shorten_words(text: str) -> Iterator[str]:
     """Words of a span, the longest first.
 
-    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “old list”, “old”.
+    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “old list”, “old”;
+    “out of range or view”, “out of view”.
     """
     yield text.removesuffix(": ")
     if ": " in text:
@@ -208,7 +206,7 @@ def _shorten_words(text: str) -> Iterator[str]:
     yield (short := text.partition(" (from ")[0])
     yield re.sub(rf"^behind ({'|'.join(CLASSES)}) ", "behind ", short)
     yield text.partition(" from ")[0]
-    yield text.removesuffix(" list")
+    yield text.replace("range or ", "").removesuffix(" list")
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 
@@ -247,11 +245,11 @@ def _span_text(
         return None
     rows = np.arange(span.first, span.end)
     rows = rows[status.status[rows, m] == span.status]
-    unit = status.unit_ix[rows, m]
-    body = sight.body_ix[unit, np.maximum(status.frame[rows], 0), m] if span.status == HIDDEN else np.zeros_like(unit)
-    pairs, count = np.unique(np.stack([unit, body]), axis=1, return_counts=True)
-    by, what = pairs[:, count.argmax()].tolist()
-    return lane_text(span.status, units[by], bodies[what])
+    unit_ix = status.unit_ix[rows, m]
+    if span.status == HIDDEN:
+        by, body = sight.find_hider(unit_ix, status.frame[rows], m)
+        return lane_text(HIDDEN, units[by], bodies[body])
+    return lane_text(span.status, units[int(np.bincount(unit_ix + 1).argmax()) - 1], "")
 
 
 def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
@@ -287,7 +285,7 @@ def _insert_title(
 
 
 def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int) -> None:
-    """Put the title before the first text on the axis, “PEM: out of view”: it has no room of its own."""
+    """Put the title before the first text on the axis, “PEM: hidden”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
     told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
     if told_at is not None:

@@ -44,8 +44,8 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
 )
 _FALSE, _DISC = _MARKS[-1][0], "disc: place ± 2σ"
 _STATUSES = {
-    OUT: "out of view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed", LOST: "list lost",
-    CAPTURED: "on its way", UNMATCHED: "unmatched",
+    OUT: "out of range or view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed",
+    LOST: "list lost", CAPTURED: "on its way", UNMATCHED: "unmatched",
 }  # fmt: skip
 """Words of statuses in lanes, in the order in which they follow each other."""
 _BROAD_POINTS = 4.0

@@ -22,6 +22,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.sight import Sight, compute_sight, find_looked_at
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
@@ -51,7 +52,6 @@ from copem_replay.viewer.events import (
 )
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
 from copem_replay.viewer.legend import write_legend_bars
-from copem_replay.viewer.line_of_sight import Sight, compute_sight, find_looked_at
 from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # Statuses of an object in a configuration, by number; `viewer/status.py` defines them.
 
 STATUSES = (
-    "absent", "not listed", "out of view", "hidden", "visible", "lost", "captured", "unmatched",
+    "absent", "not listed", "out of range or view", "hidden", "visible", "lost", "captured", "unmatched",
     "listed before the onset", "listed, not confirmed", "listed too late", "known",
 )  # fmt: skip
 (

@@ -7,9 +7,9 @@ that holds for the object and the units of the configuration:
 |---|---|
 | absent | the object is not in the log |
 | not listed | it is; the lists of the units are recorded, so what they can see is unknown |
-| out of view | no unit has it in its field of view |
-| hidden | units have, but none sees more than `CLEAR_ABOVE` of it |
-| visible | a unit sees more, but no list under way holds it |
+| out of range or view | no unit has it within the range and view of a couple, or there is no unit |
+| hidden | units have, but would list it only if nothing hid it |
+| visible | it is in sight of a unit, but no list under way holds it |
 | lost | a unit's newest list holds it, and never arrives |
 | captured | a list that holds it is under way |
 | unmatched | a unit's newest list that arrived holds it, but no entry of the fused list is matched with it |
@@ -21,7 +21,7 @@ that holds for the object and the units of the configuration:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,11 +32,13 @@ from copem_replay.communication.arrivals import fusion_schedule
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
+from copem_replay.perception.observation import HIDDEN as IS_HIDDEN
+from copem_replay.perception.observation import IN_SIGHT, OUT_OF_VIEW
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.sight import Sight, name_bodies
 from copem_replay.viewer.camera import below_bodies
-from copem_replay.viewer.line_of_sight import CLEAR_ABOVE, Sight
 from copem_replay.viewer.sensors import unit_places
 from copem_replay.viewer.sink import (
     ABSENT,
@@ -149,13 +151,12 @@ def compute_status(
 
 
 def _find_best_unit(sight: Sight, units: list[int], m: int, present: Bool, statuses: Status) -> None:
-    """Fill column m of `statuses` with the unit that sees most of the object, as hidden or visible."""
-    share = sight.share[units][:, np.maximum(statuses.frame, 0), m]
-    best = np.argmax(np.nan_to_num(share, nan=-1.0), axis=0)
-    largest = share[best, np.arange(len(best))]
-    looked = present & ~np.isnan(largest)
-    statuses.status[looked, m] = np.where(largest[looked] > CLEAR_ABOVE, VISIBLE, HIDDEN)
-    statuses.unit_ix[looked, m] = np.array(units)[best[looked]]
+    """Fill column m of `statuses` with the best that any unit has of the object, and the unit; −1: none is there."""
+    state, unit_ix = (values[np.maximum(statuses.frame, 0)] for values in sight.find_best(units, m))
+    looked = present & (state >= OUT_OF_VIEW)
+    words = {OUT_OF_VIEW: OUT, IS_HIDDEN: HIDDEN, IN_SIGHT: VISIBLE}
+    statuses.status[looked, m] = [words[value] for value in state[looked].tolist()]
+    statuses.unit_ix[looked, m] = unit_ix[looked]
 
 
 def _find_object_lists(lists: Tracks, unit: int, object_ix: int) -> tuple[Int, Float, Int]:
@@ -290,18 +291,12 @@ def explain_status(
     columns = np.stack([column, status, unit, *whole, body, near, started], axis=-1)
     keys, which = _find_distinct_rows(columns)
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # index −1: the truth, or no unit
-    bodies = name_bodies(scene, sight.solids)
+    bodies = name_bodies(scene, sight.solids, ids)
     details = [(ids[sight.object_ix[key[0]]], units[key[2]], bodies[key[5]], key) for key in keys.tolist()]
     picked = pa.array(which)
     labels = [_format_label(name, unit, hider, key) for name, unit, hider, key in details]
     sentences = [_format_sentence(name, unit, hider, key) for name, unit, hider, key in details]
     return Reasons(pa.array(labels, pa.string()).take(picked), pa.array(sentences, pa.string()).take(picked), which)
-
-
-def name_bodies(scene: Scene, solids: Sequence[str]) -> list[str]:
-    """Names of bodies that may hide: “bus 12” of the object with that index, and of the solid k at −1 − k."""
-    objects = [f"{CLASSES[k]} {name}" for name, k in zip(short_ids(scene), scene.object_class, strict=True)]
-    return [*objects, *reversed(solids)]
 
 
 def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
@@ -328,7 +323,7 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
         VISIBLE: " not listed yet" if unit == TRUTH else " not listed",
         HIDDEN: f" behind {hider}",
     }
-    return name + words.get(status, " out of view" if near else " out of range")
+    return name + words.get(status, " no unit there" if unit == TRUTH else " out of view" if near else " out of range")
 
 
 def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
@@ -351,6 +346,8 @@ def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
         return f"{name} not listed"
     if status == HIDDEN:
         return f"{name} hidden from {unit} by {hider} (share {hundredths / 100:.2f})"
+    if unit == TRUTH:
+        return f"{name}: no unit there"
     return f"{name} outside fields of view" if near else f"{name} out of range"
 
 
@@ -362,6 +359,8 @@ def lane_text(status: int, unit: str, hider: str) -> str:
         return "not listed yet" if unit == TRUTH else f"seen by {unit}, not listed"
     if status == CAPTURED:
         return f"on its way from {unit}"
+    if status == OUT and unit == TRUTH:
+        return "no unit there"
     return "old list" if status == EARLY else STATUSES[status]
 
 

@@ -13,8 +13,8 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import read_log
-from copem_replay.metrics.episodes import earliest_sight_s, first_sights
-from copem_replay.perception.observation import observe_objects
+from copem_replay.metrics.sight import SightSpans, find_sight_changes, join_sight_changes, measure_sight
+from copem_replay.perception.observation import HIDDEN, IN_SIGHT, NO_UNIT, OUT_OF_VIEW, observe_objects
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -39,6 +39,7 @@ EXPERIMENT = {
         "alone": {"units": ["ego"], "latency_s": 0.3},
         "guess": {"units": ["guess"]},
         "both": {"units": ["ego", "blind"]},
+        "animals": {"units": ["blind"]},
     },
     "measure": {"objects": {"classes": ["pedestrian"]}, "onset": {"kind": "at", "time_s": 0.5}},
     "show": None,
@@ -54,14 +55,18 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_recording(tmp_path_factory.mktemp("logs") / "drive.mcap", frames, host=1)
 
 
-def test_in_sight_is_when_the_first_list_shows_it_whatever_is_made_of_it(log: Path) -> None:
+def test_in_sight_is_when_the_first_list_may_have_it(log: Path) -> None:
+    """The onset is at 0.5 s, the lorry hides him until 1.1 s; a mast for animals alone has him out of its view."""
     result = run_experiment(Experiment.model_validate(EXPERIMENT), [read_log(log, name="drive")])
     rows = study_rows(result).set_index("configuration")
-    found = {name: rows.loc[name, ["in_sight_s", "captured_s", "detection_s"]].tolist() for name in rows.index}
-    assert np.isnan(found["GT"][0]), "the truth needs no sight"
-    assert found["alone"] == pytest.approx([1.1, 1.1, 1.4]), "the latency does not change what is in sight"
-    assert found["guess"] == pytest.approx([1.1, 0.5, 0.5]), "listed while hidden"
-    assert found["both"] == pytest.approx([0.5, 1.1, 1.1]), "in sight of a unit that never lists it"
+    names = ["in_sight_s", "out_of_view_s", "hidden_s", "captured_s", "detection_s"]
+    found = {name: rows.loc[name, names].tolist() for name in rows.index}
+    assert np.isnan(found["GT"][:3]).all(), "the truth needs no sight"
+    assert found["alone"] == pytest.approx([1.1, 0, 0.6, 1.1, 1.4]), "the latency does not change what is in sight"
+    assert found["guess"] == pytest.approx([1.1, 0, 0, 0.5, 0.5]), "listed while hidden"
+    assert found["both"] == pytest.approx([1.1, 0, 0.6, 1.1, 1.1]), "the mast for animals shows nobody a pedestrian"
+    assert found["animals"][1:3] == pytest.approx([1.5, 0])
+    assert np.isnan([found["animals"][k] for k in (0, 3, 4)]).all(), "never in view, until the end at 2.0 s"
 
 
 def test_what_is_never_in_sight_is_null(log: Path) -> None:
@@ -70,7 +75,7 @@ def test_what_is_never_in_sight_is_null(log: Path) -> None:
     chosen = Experiment.model_validate(EXPERIMENT | {"measure": measure, "obstacles": wall})
     rows = study_rows(run_experiment(chosen, [read_log(log, name="drive")])).set_index("configuration")
     assert np.isnan(rows.loc["alone", "in_sight_s"])
-    assert rows.loc["both", "in_sight_s"] == 0.0
+    assert rows.loc["alone", ["out_of_view_s", "hidden_s"]].tolist() == pytest.approx([0.0, 2.0])
 
 
 def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
@@ -88,19 +93,37 @@ def test_only_units_that_are_there_in_a_run_have_it_in_sight() -> None:
             },
         }
     )
-    first_s = np.array([[3.0, 1.0], [2.0, np.inf], [np.inf, np.inf]])  # a, b, c; two looks
+    # Units a, b, c; two episodes with their onset at 0 s. a sees the first at 3 s, the second at 1 s.
+    inf, nan = np.inf, np.nan
+    spans = SightSpans(*map(np.array, zip(*[
+        (0, 0, 0.0, 2.5, OUT_OF_VIEW), (0, 0, 2.5, 3.0, HIDDEN), (0, 0, 3.0, inf, IN_SIGHT),
+        (0, 1, 1.0, inf, IN_SIGHT),
+        (1, 0, 0.0, 2.0, HIDDEN), (1, 0, 2.0, inf, IN_SIGHT),
+        (1, 1, 0.0, 4.0, HIDDEN), (1, 1, 4.0, inf, OUT_OF_VIEW),
+    ], strict=True)))  # fmt: skip
     equipped = np.array([[True, True, True, True], [True, False, False, True], [False, True, True, True]])
 
-    def of(name: str, there: np.ndarray | None) -> list[list[float]]:
-        found = earliest_sight_s(first_s, chosen, chosen.units_of(chosen.configurations[name]), there)
-        return [[float(v) for v in row] for row in found]
+    def of(name: str, there: np.ndarray, until_s: list[float]) -> list[list[list[float]]]:
+        units = chosen.units_of(chosen.configurations[name])
+        found = measure_sight(spans, chosen, units, there, np.array([until_s]))
+        return [np.round(values, 9).tolist() for values in found]
 
-    nan = pytest.approx(np.nan, nan_ok=True)
-    assert of("ab", None) == [[2.0, 1.0]]
-    assert of("ab", equipped) == [[2.0, 1.0], [3.0, 1.0], [2.0, nan]]
-    assert of("c", None) == [[nan, nan]]
-    assert of("rsu", None) == [[nan, nan]], "recorded units don't tell what they had in sight"
-    assert of("GT", equipped) == [[nan, nan]]
+    same = [pytest.approx(row, nan_ok=True) for row in [[nan, nan]] * 3]
+    every = equipped[:1]
+    assert of("ab", every, [9.0, 9.0]) == [[[2.0, 1.0]], [[0.0, 0.0]], [[2.0, 1.0]]]
+    assert of("ab", every, [1.5, 0.5]) == [[[2.0, 1.0]], [[0.0, 0.0]], [[1.5, 0.5]]], "until it is listed"
+    assert of("ab", equipped, [5.0, 5.0]) == [
+        [[2.0, 1.0], [3.0, 1.0], pytest.approx([2.0, nan], nan_ok=True)],
+        [[0.0, 0.0], [2.5, 0.0], [0.0, 1.0]],
+        [[2.0, 1.0], [0.5, 0.0], [2.0, 4.0]],
+    ]
+    assert of("c", every, [5.0, 5.0])[0] == [pytest.approx([nan, nan], nan_ok=True)]
+    assert of("c", every, [5.0, 5.0])[1:] == [[[0.0, 0.0]]] * 2, "no list of it: no unit there"
+    for name in ("rsu", "GT"):
+        assert [row for (row,) in of(name, every, [5.0, 5.0])] == same, (
+            "recorded units don't tell what they had in sight"
+        )
+    assert NO_UNIT not in spans.state
 
 
 def test_what_nothing_reads_is_not_computed_and_nothing_else_changes() -> None:
@@ -121,8 +144,11 @@ def test_what_nothing_reads_is_not_computed_and_nothing_else_changes() -> None:
     every = observe_objects(replay.scene, replay.truth, replay.expanded, replay.placed)
     for name in ("couple_ix", "probability", "existence"):
         assert np.array_equal(getattr(found, name), getattr(every, name)), name
-    assert np.array_equal(replay.first_sights_s, first_sights(every, replay.episodes))
-    assert np.isfinite(replay.first_sights_s).sum() > 20
+    changes = [find_sight_changes(every, replay.expanded, replay.scene.tags, replay.episodes)]
+    spans = join_sight_changes(changes, replay.episodes)
+    for name in SightSpans.__dataclass_fields__:
+        assert np.array_equal(getattr(replay.sight_spans, name), getattr(spans, name)), name
+    assert np.bincount(spans.state, minlength=4)[[OUT_OF_VIEW, HIDDEN, IN_SIGHT]].min() > 1
     known = ~np.isnan(found.view.visible_share)
     assert np.array_equal(found.view.visible_share[known], every.view.visible_share[known])
     assert 0.1 < known.mean() < 0.7

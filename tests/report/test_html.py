@@ -28,6 +28,7 @@ from copem_replay.report.figures.latency_breakdown import (
     HIDDEN,
     IN_SIGHT,
     LISTED,
+    OUT_OF_VIEW,
     PROCESSING,
     SINCE_CAPTURED,
     STAGES,
@@ -455,7 +456,8 @@ class TestWaterfall:
         given = {
             "detected": [True, True],
             "onset_s": [1.0, 1.0],
-            "in_sight_s": [2.0, 2.0],
+            "out_of_view_s": [0.0, 0.0],
+            "hidden_s": [1.0, 1.0],
             "captured_s": [3.0, 4.0],
             "detection_s": [5.0, 7.0],
         }
@@ -485,9 +487,9 @@ class TestWaterfall:
     def test_what_is_not_known_is_one_stage(self, made: Path) -> None:
         mixed = {"fusion": {"kind": "gnn"}, "latency_s": {"ego": 1.5, "weak": 1.0}}
         assert self.stages(made, self.rows(), **mixed) == {HIDDEN: 1.0, IN_SIGHT: 1.5, SINCE_CAPTURED: 2.5}
-        blind = self.rows(in_sight_s=[float("nan")] * 2)
+        blind = self.rows(out_of_view_s=[float("nan")] * 2, hidden_s=[float("nan")] * 2)
         assert self.stages(made, blind) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
-        older = self.rows().drop(columns="in_sight_s")
+        older = self.rows().drop(columns=["out_of_view_s", "hidden_s"])
         assert self.stages(made, older) == {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
 
     def test_with_a_link_ready_or_sends_the_way_is_told(self, made: Path) -> None:
@@ -496,17 +498,17 @@ class TestWaterfall:
         linked = {"link": {"kind": "radio", "latency": 0.1}}
         expected = {HIDDEN: 1.0, IN_SIGHT: 0.75, LISTED: 0.75, PROCESSING: 0.5, TRANSPORT: 1.5, FUSION: 0.5}
         assert self.stages(made, way, **linked) == expected
-        assert list(STAGES) == [HIDDEN, IN_SIGHT, UNTIL_CAPTURED, *list(expected)[2:], SINCE_CAPTURED], "drawn in order"
+        assert list(STAGES) == [OUT_OF_VIEW, HIDDEN, IN_SIGHT, UNTIL_CAPTURED, *list(expected)[2:], SINCE_CAPTURED], "drawn in order"
         at_once = way.assign(listed_s=[9.0, 9.0], sent_s=way["captured_s"])
         none = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.0, FUSION: 0.5}
         assert self.stages(made, at_once, **linked) == none, "stages that take no time are none"
-        blind = way.assign(in_sight_s=float("nan"))
+        blind = way.assign(out_of_view_s=float("nan"), hidden_s=float("nan"))
         rest = {stage: mean_s for stage, mean_s in expected.items() if stage not in (HIDDEN, IN_SIGHT)}
         assert self.stages(made, blind, **linked) == {UNTIL_CAPTURED: 1.75} | rest
 
-    def test_who_was_listed_while_hidden_was_hidden_until_then(self, made: Path) -> None:
-        found = self.stages(made, self.rows(in_sight_s=[9.0, 2.0]))
-        assert found == {HIDDEN: 1.5, IN_SIGHT: 1.0, TRANSPORT: 2.5, FUSION: 0.0}
+    def test_what_is_out_of_view_is_a_stage_of_its_own(self, made: Path) -> None:
+        found = self.stages(made, self.rows(out_of_view_s=[0.5, 1.0], hidden_s=[1.5, 0.0]))
+        assert found == {OUT_OF_VIEW: 0.75, HIDDEN: 0.75, IN_SIGHT: 1.0, TRANSPORT: 2.5, FUSION: 0.0}
 
     def test_only_the_detected_have_stages(self, made: Path) -> None:
         nan = float("nan")

@@ -85,15 +85,15 @@ def test_log_by_log_they_are_as_of_all_rows(several: Path) -> None:
     np.testing.assert_array_equal(np.concatenate(list(pivot_by_run(results, "detection_s"))), times.to_numpy())
 
 
-def test_in_sight_in_one_log_alone(several: Path) -> None:
-    """Where it was never in sight until it was listed it was hidden until then, as if all rows were of one log."""
+def test_in_sight_known_in_one_log_alone(several: Path) -> None:
+    """Where recorded units do not tell what they had in sight, this is one stage of all logs."""
     experiment = read_results(several).experiment
     one = pd.DataFrame({"detected": True, "onset_s": 1.0, "captured_s": [3.0, 4.0], "detection_s": [5.0, 7.0]})
-    logs = [one.assign(configuration="half", in_sight_s=sight_s) for sight_s in (2.0, np.nan)]
+    logs = [one.assign(configuration="half", out_of_view_s=0.0, hidden_s=hidden_s) for hidden_s in (1.0, np.nan)]
     results: Any = SimpleNamespace(
         experiment=experiment, facts=find_facts(experiment), each=lambda *columns: iter(logs)
     )
-    expected = {HIDDEN: 1.75, IN_SIGHT: 0.75, TRANSPORT: 2.5, FUSION: 0.0}
+    expected = {UNTIL_CAPTURED: 2.5, TRANSPORT: 2.5, FUSION: 0.0}
     assert mean_stages_by_configuration(results, ["half"]) == {"half": expected}
     assert mean_stages(pd.concat(logs), experiment, "half") == expected
 

@@ -19,9 +19,9 @@ from copem_replay.io.recording import Recording, read_log
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.sight import compute_sight
 from copem_replay.results.shown_objects import choose_shown_objects
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.line_of_sight import compute_sight
 from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
 from copem_replay.viewer.status import compute_status, read_episode_clocks
 from tests.helpers.recordings import SHARED

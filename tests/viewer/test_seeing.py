@@ -284,7 +284,7 @@ def test_the_legend_names_statuses_and_what_is_common(city: Made) -> None:
     said = set(names.column("Points2D:labels").to_pylist()[0])
     assert {"truth", "ego", "hides it", "field of view", "false, dashed"} <= said
     assert {"disc: place ± 2σ", "listed, not known"} <= said, "what else is in pictures and lanes"
-    assert {"hidden", "out of view", "list lost", "on its way", "unmatched", "not listed"} <= said
+    assert {"hidden", "out of range or view", "list lost", "on its way", "unmatched", "not listed"} <= said
     assert set(city.given.configurations) - {"GT"} <= said | {"truth"}
     # A word hangs below its point: on a bar from above its middle, below a line that would strike it through.
     labels, places = (names.column(f"Points2D:{what}").to_pylist()[0] for what in ("labels", "positions"))

@@ -183,9 +183,9 @@ def test_the_words_say_how_much_is_seen(tmp_path: Path) -> None:
     # the ray over the wall meets the ground at his face.
     low = WALL | {"polygon_m": [[14.5, -9], [14.9, -9], [14.9, 9], [14.5, 9]], "ground_z_m": 0.0, "height_m": 1.5}
     scene = recording([Thing("ego", "car", standing(0, 0)), Thing("9", "pedestrian", standing(30, 0))], until_s=1.0)
-    blind = [{"detection": {"kind": "constant", "probability": 0.0}}]
+    half = [{"when": {"visible_share": [0.5, 1]}, "detection": {"kind": "constant", "probability": 1.0}}]
     made = make(
-        tmp_path / "x.rrd", scene, obstacles=[low], measure=PERSON, pems={"sure": blind},
+        tmp_path / "x.rrd", scene, obstacles=[low], measure=PERSON, pems={"sure": half},
         units={"ego": EGO_UNIT | {"height_m": 2.0}},
     )  # fmt: skip
     # From 2 m over 1.5 m at 14.9 m: 1 m up at 29.75 m, give or take the wall's thickness: 0.8 m of 1.8 m are seen.
@@ -202,12 +202,12 @@ def test_out_of_range_beside_the_field_and_seen_but_not_listed(tmp_path: Path) -
         ],
         until_s=1.0,
     )
-    blind = [SECTOR[0] | {"detection": {"kind": "constant", "probability": 0.0}}]
-    made = make(tmp_path / "x.rrd", scene, pems={"sure": blind}, measure=PERSON)
+    unlucky = [SECTOR[0] | {"detection": {"kind": "constant", "probability": 1e-9}}]
+    made = make(tmp_path / "x.rrd", scene, pems={"sure": unlucky}, measure=PERSON)
     assert told(made.path, "PEM", 0.5) == ["6 out of range", "7 outside fields of view", "8 seen by ego, not listed"]
     assert [lane(made.path, f"{k} pedestrian", 0) for k in (6, 7, 8)] == [
-        [(0, "out of view")],
-        [(0, "out of view")],
+        [(0, "out of range or view")],
+        [(0, "out of range or view")],
         [(0, "seen by ego, not listed")],
     ]
 
@@ -416,7 +416,7 @@ def titles(path: Path) -> set[str]:
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
-    from copem_replay.viewer.line_of_sight import compute_sight
+    from copem_replay.pipeline.sight import compute_sight
     from copem_replay.viewer.sink import CAPTURED, KNOWN, LOST
     from copem_replay.viewer.status import compute_status, read_episode_clocks
 
@@ -443,7 +443,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
     from dataclasses import replace
 
-    from copem_replay.viewer.line_of_sight import compute_sight
+    from copem_replay.pipeline.sight import compute_sight
     from copem_replay.viewer.sink import LOST, UNMATCHED, VISIBLE
     from copem_replay.viewer.status import compute_status, read_episode_clocks
 

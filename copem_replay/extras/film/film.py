@@ -28,10 +28,10 @@ from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Floa
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.perception.visibility import rectangle_corners
 from copem_replay.pipeline.one_run import ReplayedRun
+from copem_replay.pipeline.sight import Sight, compute_sight
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
 from copem_replay.results.again import replay_again
 from copem_replay.results.outputs import check_output, made_file
-from copem_replay.viewer.line_of_sight import Sight, compute_sight
 from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, elapsed_ns, short_ids, to_nanoseconds
 from copem_replay.viewer.status import (
     NEVER_NS,

@@ -2,22 +2,21 @@
 
 | stage | from | to |
 |---|---|---|
-| hidden | the onset | the first list of any of the configuration's units in which it is in sight (`in_sight_s`) |
-| in sight | in sight | the first list that has the object (`listed_s`) |
+| out of range or view, hidden, in sight | the onset | the first list that has the object (`listed_s`) |
 | listed | first list | the newest capture that contributed to knowing (`captured_s`) |
 | processing | capture | the instant at which that list is ready to be sent (`sent_s`) |
 | transport | ready | its arrival (`arrived_s`): captured plus latency without a link and `ready` |
 | fusion | arrival | the fused list with which it is known (`detection_s`) |
 
-Means are over the detected rows, so that stages add up. An object listed while no unit had it in sight counts as hidden
-until it is listed. Only the newest capture of a confirmation is known, so the time of a confirmation, and that in which
+Means are over the detected rows, so that stages add up. Until it is listed, an object is out of range or view of all of
+the configuration's units, or hidden from those that have it in view (`out_of_view_s`, `hidden_s`), or in sight. Only the newest capture of a confirmation is known, so the time of a confirmation, and that in which
 another unit's list of the object is on its way, belong to *listed* where the instants of lists on their way are known
 (`WAY` in `metrics/detections_table.py`), and to *in sight* elsewhere.
 
 Without these instants, ideal fusion and the truth know an object from the list that brings it (one hit): all time from
 the capture on is transport. Otherwise transport is the latency if all units have one latency; if not, transport and
-fusion are one stage, *since captured*. The first two stages are one, *until captured*, if the instant of coming into
-sight is unknown: for the truth, and for recorded units. With `count_earlier` times may be negative, and the figure is
+fusion are one stage, *since captured*. The first three stages are one, *until captured*, if it is unknown what units
+have in sight: for the truth, and for recorded units. With `count_earlier` times may be negative, and the figure is
 not drawn.
 """
 
@@ -51,13 +50,17 @@ if TYPE_CHECKING:
     from copem_replay.results.read import Results
 
 
-_INSTANTS = ("onset_s", "in_sight_s", *WAY, "captured_s", "detection_s")
-HIDDEN, IN_SIGHT, UNTIL_CAPTURED, LISTED = "hidden", "in sight", "until captured", "listed"
+_SIGHT = ("out_of_view_s", "hidden_s")
+_INSTANTS = ("onset_s", *_SIGHT, *WAY, "captured_s", "detection_s")
+OUT_OF_VIEW, HIDDEN, IN_SIGHT = "out of range or view", "hidden", "in sight"
+UNTIL_CAPTURED, LISTED = "until captured", "listed"
 PROCESSING, TRANSPORT, FUSION, SINCE_CAPTURED = "processing", "transport", "fusion", "since captured"
 STAGES = {
-    HIDDEN: "from the start of the clock until any of the configuration's units has it in sight in a list it makes",
-    IN_SIGHT: "from there until the capture of the newest list that contributed to knowing it: out of range, missed by "
-    "the perception, between two lists, not yet confirmed, or listed by a unit whose list was still on its way",
+    OUT_OF_VIEW: "from the start of the clock until its first list: out of range or view of all of the configuration's "
+    "units",
+    HIDDEN: "in that time: within range and view of a unit, and hidden from all that have it there",
+    IN_SIGHT: "the rest of that time: missed by the perception, between two lists, and, where it is not known when it was "
+    "first listed, not yet confirmed, or in a list that was still on its way",
     UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
     "sight: the truth needs no sight, and recorded units do not tell",
     LISTED: "where lists come by a link, or of units with ready or sends, the last part of that time: from the capture "
@@ -71,7 +74,9 @@ STAGES = {
     SINCE_CAPTURED: "from that capture until then, where it is not known how much of it is transport: units have "
     "different latencies, or recorded ones",
 }
+_UNTIL_LISTED, _ONLY_IF_ANY = (OUT_OF_VIEW, HIDDEN, IN_SIGHT), (OUT_OF_VIEW, LISTED, PROCESSING)
 HATCHES = {
+    OUT_OF_VIEW: ("#ffffff", "", "#000000"),
     HIDDEN: ("#d9d9d9", "", "#000000"),
     IN_SIGHT: ("#8c8c8c", "///", "#ffffff"),
     UNTIL_CAPTURED: ("#ffffff", "///", "#8c8c8c"),
@@ -172,11 +177,11 @@ def _divide_sums(sums: Mapping[str, float]) -> dict[str, float]:
     """Means from sums over rows, whose number is under ""; empty without a detection."""
     sums = dict(sums)
     count = sums.pop("", 0.0)
-    if HIDDEN in sums and UNTIL_CAPTURED in sums:  # logs with and without instants in sight
-        sums[HIDDEN] += sums.pop(UNTIL_CAPTURED)
+    if IN_SIGHT in sums and UNTIL_CAPTURED in sums:  # logs of which it is known, and others
+        sums = {UNTIL_CAPTURED: sum(sums.pop(stage, 0.0) for stage in (*_UNTIL_LISTED, UNTIL_CAPTURED))} | sums
     # Rounded to a nanosecond: in floats 3.9 − 3 is not 0.9.
     means = {stage: float(np.round(sum_s / count, 9)) + 0.0 for stage, sum_s in sums.items()}
-    return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in (LISTED, PROCESSING)}
+    return {stage: mean_s for stage, mean_s in means.items() if mean_s or stage not in _ONLY_IF_ANY}
 
 
 def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str, facts: ConfigurationFacts) -> dict[str, float]:
@@ -186,15 +191,15 @@ def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str, facts: Co
         return {}
     onset_s, captured_s, known_s = (rows[c].to_numpy(dtype=float) for c in ("onset_s", "captured_s", "detection_s"))
     result = {}
-    sight_s, listed_s, sent_s, arrived_s = (
-        rows[c].to_numpy(dtype=float) if c in rows else np.full(len(rows), np.nan) for c in ("in_sight_s", *WAY)
+    out_of_view_s, hidden_s, listed_s, sent_s, arrived_s = (
+        rows[c].to_numpy(dtype=float) if c in rows else np.full(len(rows), np.nan) for c in (*_SIGHT, *WAY)
     )
     listed_s = np.fmin(listed_s, captured_s)
-    if np.isnan(sight_s).all():
+    if np.isnan(hidden_s).any():
         result[UNTIL_CAPTURED] = listed_s - onset_s
     else:
-        seen_s = np.fmin(sight_s, listed_s)
-        result |= {HIDDEN: seen_s - onset_s, IN_SIGHT: listed_s - seen_s}
+        in_sight_s = listed_s - onset_s - out_of_view_s - hidden_s
+        result |= {OUT_OF_VIEW: out_of_view_s, HIDDEN: hidden_s, IN_SIGHT: in_sight_s}
     if experiment.has_way(name):
         arrived_s = np.fmin(arrived_s, known_s)
         sent_s = np.fmin(sent_s, arrived_s)

@@ -1,19 +1,24 @@
-"""Line of sight: visible share of the shown objects from every modelled unit, and the body that hides most of them."""
+"""Sight at the frames of the truth: what every modelled unit has of some objects, and the body that hides most of them.
+
+Lanes, stories and causes name what they name from here. Columns of tables come from the same states, at the lists of
+units (`metrics/sight.py`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from copem_replay.core.errors import is_own
-from copem_replay.core.interpolation import interpolate_at_instants, wrap_angles
-from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Solid, Tracks
+from copem_replay.core.interpolation import interpolate_at_instants
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, SAME_INSTANT_S, Bool, Float, Int, Scene, Solid, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
-from copem_replay.perception.observation import Observations
-from copem_replay.perception.pem.condition import Condition, Couple
+from copem_replay.perception.observation import HIDDEN, NO_UNIT, Observations, compute_view, judge_sight
+from copem_replay.perception.pem.condition import Condition, Couple, may_apply
 from copem_replay.perception.sensor_poses import (
     UnitPoses,
     compute_unit_poses,
@@ -24,10 +29,9 @@ from copem_replay.perception.sensor_poses import (
 from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.viewer.sink import stack_float32
 
-CLEAR_ABOVE = 0.5
-"""An object counts as visible above this share, as hidden below: the larger part of it decides."""
+ABSENT = -1
+"""The state of an object that is not in the log; others are those of `perception/observation.py`."""
 
 ROWS_AT_ONCE = 60_000
 """Rows of the world that are looked at together. It changes time and memory alone."""
@@ -35,20 +39,82 @@ ROWS_AT_ONCE = 60_000
 
 @dataclass(frozen=True)
 class Sight:
-    """Objects (M,) as seen from the experiment's units (U,) at frames of the truth (K,); NaN for recorded units.
+    """Objects (M,) as seen from the experiment's units (U,) at frames of the truth (K,).
 
-    `share`: NaN outside the unit's field of view, while the unit is absent, and for its carrier. `body_ix`: the object
-    that hides most of an object with a share up to `CLEAR_ABOVE`, or −1 − k for the solid k; `body_m`: its centre.
+    `state`: `ABSENT` of objects that are not there, and of recorded units, too. `share`: NaN outside the unit's field
+    of view, while the unit is absent, and for its carrier. `body_ix`: the object that hides most of a hidden object, or
+    −1 − k for the solid k; `body_m`: its centre.
     """
 
     elapsed_ns: Int  # (K,)
     object_ix: Int  # (M,)
+    state: Int  # (U, K, M)
     share: Float  # (U, K, M)
     in_range: Bool  # (U, K, M)
     body_ix: Int  # (U, K, M)
     body_m: Float  # (U, K, M, 3)
     solids: tuple[str, ...]  # names
     place_m: Float  # (U, K, 3), of the units
+
+    def find_best(self, units: Sequence[int], m: int) -> tuple[Int, Int]:
+        """(K,) the best state that some modelled units have of object m, and whose: of equal ones who sees most."""
+        state = self.state[units][:, :, m]
+        best = np.argmax(state + 0.5 * np.nan_to_num(self.share[units][:, :, m]), axis=0)
+        return state[best, np.arange(len(best))], np.array(units)[best]
+
+    def find_hider(self, unit_ix: Int, frames: Int, m: int) -> tuple[int, int]:
+        """The most frequent unit and body that hides object m from it, of pairs (n,) of a unit and a frame."""
+        seen = np.unique(np.stack([unit_ix, frames]), axis=1)
+        pairs, count = np.unique(np.stack([seen[0], self.body_ix[seen[0], seen[1], m]]), axis=1, return_counts=True)
+        by, body = pairs[:, count.argmax()].tolist()
+        return by, body
+
+
+@dataclass(frozen=True)
+class SightSpan:
+    """A time from `begin_s` to `end_s`, seconds since the log's start, in which the units of a configuration have an
+    object in one state; of a hidden one from whom, `unit`, and by what, `body`, in words and as in `Sight.body_ix`.
+    """
+
+    state: int
+    begin_s: float
+    end_s: float
+    unit: str = ""
+    body: str = ""
+    body_ix: int = 0
+
+
+def list_sight_spans(
+    replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
+) -> list[SightSpan]:
+    """What the units `names` have of object m between two instants, in order; nothing where none is modelled."""
+    every = list(replay.expanded.units)
+    units = [every.index(name) for name in names if name in replay.expanded.modelled]
+    time_s = sight.elapsed_ns * 1e-9
+    frames = np.flatnonzero(
+        (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
+    )
+    if not units or not len(frames):
+        return []
+    state, unit_ix = (values[frames] for values in sight.find_best(units, m))
+    bodies, spans = name_bodies(replay.scene, sight.solids, replay.scene.object_ids), list[SightSpan]()
+    cuts = np.flatnonzero(np.diff(state)) + 1
+    for some in np.split(np.arange(len(frames)), cuts):
+        begin_s = max(float(time_s[frames[some[0]]]), from_s)
+        after = some[-1] + 1
+        end_s = float(time_s[frames[after]]) if after < len(frames) else until_s
+        what: dict[str, Any] = {}
+        if (of := int(state[some[0]])) == HIDDEN:
+            by, body_ix = sight.find_hider(unit_ix[some], frames[some], m)
+            what = {"unit": every[by], "body": bodies[body_ix], "body_ix": body_ix}
+        spans.append(SightSpan(of, begin_s, end_s, **what))
+    return spans
+
+
+def name_bodies(scene: Scene, solids: Sequence[str], ids: Sequence[str]) -> list[str]:
+    """Names of bodies that may hide: “bus 12” of the object with that index, and of the solid k at −1 − k."""
+    objects = [f"{CLASSES[k]} {name}" for name, k in zip(ids, scene.object_class, strict=True)]
+    return [*objects, *reversed(solids)]
 
 
 def compute_sight(
@@ -64,6 +130,7 @@ def compute_sight(
     sight = Sight(
         elapsed_ns=stamps - scene.t0_ns,
         object_ix=np.array(shown, dtype=np.int64),
+        state=np.full(shape, ABSENT),
         share=np.full(shape, np.nan),
         in_range=np.zeros(shape, dtype=bool),
         body_ix=np.zeros(shape, dtype=np.int64),
@@ -126,14 +193,19 @@ def _compute_part(
         if unit.recorded is not None:
             continue
         poses = _unit_poses(replay, name, unit, world)
-        view = _make_view_geometry(poses, world, rows, scene.object_class[world.row_object_ix[rows]])
-        pem = experiment.pems[str(unit.pem)].couples
-        in_field = _fits_any_couple(pem, view, "range_m", "azimuth_deg", "classes")
+        class_ix, unseen = scene.object_class[world.row_object_ix[rows]], np.full(len(rows), np.nan)
+        with np.errstate(invalid="ignore"):  # where the unit is absent
+            view = compute_view(world.take_rows(rows), poses, world.frame_ix[rows], unseen, class_ix)
+            pem = experiment.pems[str(unit.pem)].couples
+            in_field = may_apply(pem, view, scene.tags)
+            sight.in_range[u, frame, column] = _is_in_range(pem, view)
         sight.place_m[u, part] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)
-        sight.in_range[u, frame, column] = _fits_any_couple(pem, view, "range_m")
         known = np.where(in_field, known_shares[u, frame, column], 0.0)
         share = _visible_shares(replay, experiment, unit, poses, world, rows, known)
-        sight.share[u, frame, column] = np.where(in_field, share, np.nan)
+        sight.share[u, frame, column] = share = np.where(in_field, share, np.nan)
+        state = judge_sight(str(unit.pem), experiment, replace(view, visible_share=share), scene.tags)
+        there = poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != find_carrier(scene, unit))
+        sight.state[u, frame, column] = np.where(there, state, NO_UNIT)
         _find_hiders(replay, experiment, unit, poses, sight, u, part, centres)
 
 
@@ -213,7 +285,7 @@ def _find_hiders(
 
     `poses`: of the unit at the frames of the `part`.
     """
-    within = np.flatnonzero((sight.share[u, part] <= CLEAR_ABOVE).any(axis=1))
+    within = np.flatnonzero((sight.state[u, part] == HIDDEN).any(axis=1))
     if not len(within):
         return
     frames = part.start + within
@@ -230,32 +302,14 @@ def _find_hiders(
     count = len(world.frame_ix)
     body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
     bodies = np.concatenate([world.row_object_ix, -1 - np.arange(len(centres))])
-    body_m = np.concatenate([stack_float32(world.x_m[0], world.y_m[0], world.z_m[0]), centres])
+    body_m = np.concatenate([np.stack([world.x_m[0], world.y_m[0], world.z_m[0]], axis=-1), centres])
     sight.body_ix[u, frames[world.frame_ix[rows]], column] = bodies[body]
     sight.body_m[u, frames[world.frame_ix[rows]], column] = body_m[body]
 
 
-def _make_view_geometry(poses: UnitPoses, world: Tracks, rows: Int, class_ix: np.ndarray) -> ViewGeometry:
-    """The view geometry that fields of view depend on: range, azimuth, bearing and class; NaN for the rest."""
-    frames = world.frame_ix[rows]
-    dx, dy = world.x_m[0, rows] - poses.x_m[frames], world.y_m[0, rows] - poses.y_m[frames]
-    bearing = np.arctan2(dy, dx)
-    nothing = np.full(len(dx), np.nan)
-    unset = dict.fromkeys(ViewGeometry.__dataclass_fields__, nothing)
-    values = {
-        "range_m": np.hypot(dx, dy),
-        "azimuth_rad": wrap_angles(bearing - poses.heading_rad[frames]),
-        "bearing_rad": bearing,
-        "class_ix": class_ix,
-    }
-    return ViewGeometry(**(unset | values))
-
-
-def _fits_any_couple(pem: tuple[Couple, ...], view: ViewGeometry, *keys: str) -> Bool:
-    """(P,) whether these keys of the condition of any couple hold."""
-    conditions = [Condition(**{key: getattr(couple.when, key) for key in keys}) for couple in pem]
-    with np.errstate(invalid="ignore"):
-        held: Bool = np.any([condition.holds(view) for condition in conditions], axis=0)
+def _is_in_range(pem: tuple[Couple, ...], view: ViewGeometry) -> Bool:
+    """(P,) whether the range of any couple holds."""
+    held: Bool = np.any([Condition(range_m=couple.when.range_m).holds(view) for couple in pem], axis=0)
     return held & ~np.isnan(view.range_m)
 
 
@@ -265,4 +319,4 @@ def _centres(solids: Sequence[Solid]) -> np.ndarray:
 
     middle = shapely.centroid([shapely.Polygon(solid.corners_m) for solid in solids])
     halfway_m = np.array([(solid.bottom_m + solid.top_m) / 2 for solid in solids])
-    return stack_float32(shapely.get_x(middle), shapely.get_y(middle), halfway_m)
+    return np.stack([shapely.get_x(middle), shapely.get_y(middle), halfway_m], axis=-1)

@@ -1,0 +1,147 @@
+"""Sight spans: what the units of a configuration have of each episode, from the onset on, from list to list.
+
+The states are those of `perception/observation.py`, and of several units the best counts. What a list tells holds until
+the unit's next one; what the first after the onset tells holds from the onset on, unless it is in sight, which begins
+with that list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.metrics.config import MetricsSetup
+from copem_replay.metrics.episodes import Episodes
+from copem_replay.perception.observation import HIDDEN, IN_SIGHT, OUT_OF_VIEW, Observations, judge_sight, rows_by_unit
+
+
+@dataclass(frozen=True)
+class SightSpans:
+    """Spans (K,) of one state, by episode and begin: of single units, `unit_ix` of the modelled ones, or of several.
+
+    `end_s` is inf where nothing follows.
+    """
+
+    unit_ix: Int
+    episode_ix: Int
+    begin_s: Float
+    end_s: Float
+    state: Int
+
+    def of_units(self, units: Collection[int]) -> SightSpans:
+        """The spans of some units together, in each the best of their states."""
+        rows = np.flatnonzero(np.isin(self.unit_ix, list(units)))
+        steps = np.zeros((len(rows), IN_SIGHT + 1), dtype=np.int64)
+        steps[np.arange(len(rows)), self.state[rows]] = 1
+        episode_ix, at_s = np.tile(self.episode_ix[rows], 2), np.concatenate([self.begin_s[rows], self.end_s[rows]])
+        order = np.lexsort((at_s, episode_ix))
+        episode_ix, at_s = episode_ix[order], at_s[order]
+        holding = np.cumsum(np.concatenate([steps, -steps])[order], axis=0) > 0
+        state = IN_SIGHT - holding[:, ::-1].argmax(axis=1)
+        end_s = np.append(at_s[1:], np.inf)
+        kept = holding.any(axis=1) & (end_s > at_s)  # where none holds, an episode ends
+        return SightSpans(np.full(kept.sum(), -1), episode_ix[kept], at_s[kept], end_s[kept], state[kept])
+
+    def first_s(self, state: int, episodes: int) -> Float:
+        """(M,) when each of so many episodes is first in a state; NaN: never."""
+        rows, first_s = self.state == state, np.full(episodes, np.inf)
+        np.minimum.at(first_s, self.episode_ix[rows], self.begin_s[rows])
+        return np.where(np.isfinite(first_s), first_s, np.nan)
+
+    def seconds(self, state: int, episode_ix: Int, until_s: Float) -> Float:
+        """(n,) how long episodes (n,) are in a state until an instant each."""
+        spans = self.episode_ix[rows := np.flatnonzero(self.state == state)]
+        first, after = (np.searchsorted(spans, episode_ix, side=side) for side in ("left", "right"))
+        count = after - first
+        which = np.repeat(np.arange(len(episode_ix)), count)
+        span = rows[np.arange(len(which)) - np.repeat(np.cumsum(count) - count - first, count)]
+        lasts_s = np.clip(np.minimum(until_s[which], self.end_s[span]) - self.begin_s[span], 0.0, None)
+        return np.bincount(which, lasts_s, len(episode_ix)).astype(float)
+
+
+class SightChanges(NamedTuple):
+    """The lists (K,) of modelled units in which the state of an episode is another than in the unit's list before."""
+
+    unit_ix: Int
+    episode_ix: Int
+    captured_s: Float
+    state: Int
+
+    def take(self, rows: Int) -> SightChanges:
+        """Some of them."""
+        return SightChanges(self.unit_ix[rows], self.episode_ix[rows], self.captured_s[rows], self.state[rows])
+
+
+def find_sight_changes(
+    observations: Observations, experiment: MetricsSetup, tags: Mapping[str, str], episodes: Episodes
+) -> SightChanges:
+    """The changes in the lists of a time chunk. `tags`: those of the log."""
+    tracks = observations.tracks
+    episode_ix = episodes.number_rows(tracks)
+    state = np.zeros(len(episode_ix), dtype=np.int64)
+    for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
+        rows = rows[episode_ix[rows] >= 0]
+        state[rows] = judge_sight(str(unit.pem), experiment, observations.view.take(rows), tags)
+    rows = np.flatnonzero(episode_ix >= 0)
+    return _keep_changes(
+        SightChanges(tracks.row_unit_ix[rows], episode_ix[rows], tracks.row_captured_s[rows], state[rows])
+    )
+
+
+def _keep_changes(lists: SightChanges) -> SightChanges:
+    order = np.lexsort((lists.captured_s, lists.episode_ix, lists.unit_ix))
+    lists = lists.take(order)
+    same = [column[1:] == column[:-1] for column in (lists.unit_ix, lists.episode_ix, lists.state)]
+    kept = np.flatnonzero(np.append(True, ~np.all(same, axis=0))[: len(order)])
+    return lists.take(kept)
+
+
+def join_sight_changes(chunks: Sequence[SightChanges], episodes: Episodes) -> SightSpans:
+    """The spans of single units over the whole log."""
+    unit_ix, episode_ix, begin_s, state = _keep_changes(SightChanges(*map(np.concatenate, zip(*chunks, strict=True))))
+    begins = np.append(True, (np.diff(unit_ix) != 0) | (np.diff(episode_ix) != 0))[: len(unit_ix)]
+    end_s = np.where(
+        np.append(begins[1:], True)[: len(unit_ix)], np.inf, np.append(begin_s[1:], np.inf)[: len(unit_ix)]
+    )
+    begin_s = np.where(begins & (state != IN_SIGHT), episodes.onset_s[episode_ix], begin_s)
+    return SightSpans(unit_ix, episode_ix, begin_s, end_s, state)
+
+
+class SightTimes(NamedTuple):
+    """Of one configuration, all (S | 1, M): when it first has each object in sight, and seconds before it is listed.
+
+    NaN: never, or not known: the truth needs no sight, and recorded units do not tell.
+    """
+
+    in_sight_s: Float
+    out_of_view_s: Float
+    hidden_s: Float
+
+
+def measure_sight(
+    spans: SightSpans, experiment: MetricsSetup, names: Sequence[str], equipped: Bool, until_s: Float
+) -> SightTimes:
+    """The times of the units `names`; `equipped (S | 1, U)`: which of the experiment's units each run has.
+
+    `until_s (S | 1, M)`: when each object is first listed, or its episode ends.
+    """
+    episodes = until_s.shape[1]
+    if not names or any(name in experiment.recorded for name in names):
+        return SightTimes(*np.full((3, 1, episodes), np.nan))
+    modelled, every = list(experiment.modelled), list(experiment.units)
+    patterns, which = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
+    runs = max(len(until_s), len(which))
+    until_s, which = np.broadcast_to(until_s, (runs, episodes)), np.broadcast_to(which.ravel(), runs)
+    times = np.empty((3, runs, episodes))
+    for k, there in enumerate(patterns):
+        own = spans.of_units({modelled.index(name) for name, present in zip(names, there, strict=True) if present})
+        of = np.flatnonzero(which == k)
+        each, then_s = np.tile(np.arange(episodes), len(of)), until_s[of].ravel()
+        times[0, of] = own.first_s(IN_SIGHT, episodes)
+        for row, state in enumerate((OUT_OF_VIEW, HIDDEN), start=1):
+            times[row, of] = own.seconds(state, each, then_s).reshape(len(of), episodes)
+    return SightTimes(*times)
