@@ -498,7 +498,9 @@ class TestWaterfall:
         linked = {"link": {"kind": "radio", "latency": 0.1}}
         expected = {HIDDEN: 1.0, IN_SIGHT: 0.75, LISTED: 0.75, PROCESSING: 0.5, TRANSPORT: 1.5, FUSION: 0.5}
         assert self.stages(made, way, **linked) == expected
-        assert list(STAGES) == [OUT_OF_VIEW, HIDDEN, IN_SIGHT, UNTIL_CAPTURED, *list(expected)[2:], SINCE_CAPTURED], "drawn in order"
+        assert list(STAGES) == [OUT_OF_VIEW, HIDDEN, IN_SIGHT, UNTIL_CAPTURED, *list(expected)[2:], SINCE_CAPTURED], (
+            "drawn in order"
+        )
         at_once = way.assign(listed_s=[9.0, 9.0], sent_s=way["captured_s"])
         none = {HIDDEN: 1.0, IN_SIGHT: 1.5, TRANSPORT: 2.0, FUSION: 0.5}
         assert self.stages(made, at_once, **linked) == none, "stages that take no time are none"

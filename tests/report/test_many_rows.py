@@ -21,9 +21,8 @@ from copem_replay.report.figures import Selection
 from copem_replay.report.figures.detection_curves import build_curve
 from copem_replay.report.figures.latency_breakdown import (
     FUSION,
-    HIDDEN,
-    IN_SIGHT,
     TRANSPORT,
+    UNTIL_CAPTURED,
     count_detected,
     mean_stages,
     mean_stages_by_configuration,

@@ -14,7 +14,7 @@ from copem_replay.extras.stories.story_facts import (
     ObjectStory,
     count_lost_lists,
     explain_story,
-    find_hider,
+    find_spans,
     format_seconds,
 )
 from copem_replay.extras.stories.story_pictures import draw_story
@@ -48,7 +48,7 @@ def story_parts(study: ReportData) -> list[Html]:
         return [make_tag("p", f"No plans of {log}: {NO_RECORDING}.")]
     chosen, too_short = choose_stories(drive, table, rows)
     told = {name: first_episodes(rows[rows["object_id"] == name]) for name in chosen}
-    lost = count_lost_lists(study, drive, run, told)
+    spans, lost = find_spans(study, drive, run, told), count_lost_lists(study, drive, run, told)
     several = len(study.results.provenance.logs) > 1
     said = (
         f"Run {run} of {log}: the objects that copem-replay view shows. First are those that configurations know at "
@@ -59,7 +59,7 @@ def story_parts(study: ReportData) -> list[Html]:
     short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
     for name, of in told.items():
-        story = ObjectStory(study, drive, of, None if lost is None else lost.get(name, {}))
+        story = ObjectStory(study, drive, of, spans[name], None if lost is None else lost.get(name, {}))
         parts.append(_story_element(story, log if several else None))
     return parts
 
@@ -101,8 +101,7 @@ def _name_difference(story: ObjectStory) -> str:
 
 
 def _story_element(story: ObjectStory, log: str | None) -> Html:
-    hider = find_hider(story) if story.hidden_s(story.blind) > SAME_INSTANT_S else None
-    said = explain_story(story, hider)
+    hider, said = story.hider, explain_story(story)
     title = make_tag("h3", f"{story.name}: {_name_difference(story)}")
     shown = log is None or log in story.study.results.provenance.run_shown
     command = f"copem-replay view FOLDER --object {story.object_id}" + (f" --log {log}" if log else "")

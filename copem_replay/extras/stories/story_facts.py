@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import CopemError, InputError, count_noun
+from copem_replay.core.errors import CopemError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_at_instants
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, Tracks
 from copem_replay.experiment.schema import Unit
-from copem_replay.perception.sensor_poses import (
-    UnitPoses,
-    collect_solids,
-    compute_unit_poses,
-    find_carrier,
-    make_observers,
-    make_solid_statics,
-    unit_ground,
-)
-from copem_replay.perception.visibility import find_blockers
+from copem_replay.perception.observation import HIDDEN, IN_SIGHT, NO_UNIT, OUT_OF_VIEW
+from copem_replay.perception.sensor_poses import UnitPoses, compute_unit_poses, find_carrier, unit_ground
+from copem_replay.pipeline.one_run import replay_run
+from copem_replay.pipeline.sight import SightSpan, compute_sight, list_sight_spans
 from copem_replay.report.figures.paths import Drive
 from copem_replay.report.figures.style import shorten_names
 from copem_replay.report.html.study import ReportData
@@ -37,12 +31,14 @@ from copem_replay.results.again import replay_again
 class ObjectStory:
     """One object in one run. `rows`: of its first episode, a row per configuration, with `unknown_s`.
 
+    `spans`: by configuration what its units have of the object until one first lists it; none where units are recorded.
     `lost`: by configuration how many lists with the object the radio lost until it was known; None: cannot be told.
     """
 
     study: ReportData
     drive: Drive
     rows: pd.DataFrame
+    spans: Mapping[str, list[SightSpan]]
     lost: Mapping[str, int] | None
 
     @property
@@ -80,58 +76,47 @@ class ObjectStory:
         return float(row["detection_s"] if row["detected"] else row["ended_s"])
 
     @property
-    def blind(self) -> Any:
-        """The row of the configuration whose units have it in sight last, or know it last."""
-        return self.rows.loc[self.rows.apply(self.hidden_s, axis=1).iloc[::-1].idxmax()]
-
-    def hidden_s(self, row: Any) -> float:
-        """For how long after the onset a configuration has it in no list in sight, at most until one that counts."""
-        seen_s = float(row["in_sight_s"])
-        if not self.drive.experiment.units_of(self.drive.experiment.configurations[row["configuration"]]):
-            return 0.0  # what units of a recorded output see is not known
-        listed_s = float(row["captured_s"]) if row["detected"] else self.known_s(row)
-        return (
-            max(float(np.fmin(seen_s, listed_s)) - self.onset_s, 0.0)
-            if seen_s == seen_s or not row["detected"]
-            else 0.0
-        )
-
-    def blind_unit(self) -> str | None:
-        """The unit from which that configuration should have seen it: a carried one, else its first one."""
-        experiment = self.drive.experiment
-        names = experiment.units_of(experiment.configurations[self.blind["configuration"]])
-        modelled = [name for name in names if name in experiment.modelled]
-        own = [name for name in modelled if find_carrier(self.drive.scene, experiment.modelled[name]) >= 0]
-        return next(iter([*own, *modelled]), None)
-
-
-def find_hider(story: ObjectStory) -> tuple[str, int] | None:
-    """The body that hides most of the object from its blind unit at the onset: words, and its object (−1: a solid).
-
-    None: nothing does, or it cannot be told.
-    """
-    unit_name = story.blind_unit()
-    if unit_name is None:
+    def hider(self) -> SightSpan | None:
+        """The longest time in which it is hidden from those who know it last, else from those who know it first."""
+        for row in (self.last, self.first):
+            hidden = [span for span in self.spans.get(str(row["configuration"]), ()) if _is_told(span, HIDDEN)]
+            if hidden:
+                return max(hidden, key=lambda span: span.end_s - span.begin_s)
         return None
-    drive, unit = story.drive, story.drive.experiment.modelled[unit_name]
-    world = world_at(drive, story.onset_s)
-    solids = collect_solids(drive.scene, drive.truth, drive.experiment.obstacles)
-    rows = np.flatnonzero(world.row_object_ix == drive.scene.object_number[story.object_id])
-    poses = unit_pose(drive, unit_name, unit, world)
-    if not len(rows) or not poses.present.any():
-        return None
-    observers = make_observers([poses], np.array([find_carrier(drive.scene, unit)]))
-    try:
-        [blockers] = find_blockers(world, make_solid_statics(solids), observers, drive.experiment.visibility)
-    except InputError:  # a model of the user's own that cannot tell
-        return None
-    body = int(blockers[rows[0]])
-    if body == -1:
-        return None
-    if body < -1:
-        return solids[-2 - body].name, -1
-    k = int(world.row_object_ix[body])
-    return f"{CLASSES[drive.scene.object_class[k]]} {drive.scene.object_ids[k]}", k
+
+
+_TOLD_S = 0.1
+"""Times that are no longer are left out of sentences: most units list as often."""
+
+
+def _is_told(span: SightSpan, state: int) -> bool:
+    return span.state == state and span.end_s - span.begin_s > _TOLD_S + SAME_INSTANT_S
+
+
+def listed_until_s(row: Any) -> float:
+    """Until when no list has the object, as far as it is known."""
+    listed_s = float(np.fmin(row.get("listed_s", np.nan), row["captured_s"]))
+    return float(row["ended_s"]) if np.isnan(listed_s) else listed_s
+
+
+def find_spans(
+    study: ReportData, drive: Drive, run: int, told: Mapping[str, pd.DataFrame]
+) -> dict[str, dict[str, list[SightSpan]]]:
+    """What the units of each configuration have of each object of `told` in a run, by object and configuration."""
+    replayed = replay_run(study.results.recording(drive.log, drive.experiment), drive.experiment, run)
+    replay, shown = replayed.replay, [drive.scene.object_number[name] for name in told]
+    sight = compute_sight(replay, replayed.experiment, shown)
+    expanded = replay.expanded
+    return {
+        name: {
+            str(row["configuration"]): list_sight_spans(
+                replay, sight, m, expanded.units_of(expanded.configurations[row["configuration"]]),
+                float(row["onset_s"]), listed_until_s(row),
+            )
+            for _, row in rows.iterrows()
+        }
+        for m, (name, rows) in enumerate(told.items())
+    }  # fmt: skip
 
 
 def world_at(drive: Drive, time_s: float) -> Tracks:
@@ -198,60 +183,67 @@ def find_lost(fused_tracks: FusedTracks, object_ix: int, since_s: float, until_s
 # Why, in a sentence.
 
 
-def explain_story(story: ObjectStory, hider: tuple[str, int] | None) -> str:
-    """What hid an object, why the last configuration knows it late, and how the first one knows it, in one sentence."""
-    first, last, hidden_s = story.first, story.last, story.hidden_s(story.blind)
-    parts = []
-    if hidden_s > SAME_INSTANT_S:
-        name = str(story.blind["configuration"])
-        where = (
-            f"Hidden from {story.blind_unit()} behind {hider[0]}" if hider else f"Out of sight of the units of {name}"
-        )
-        until = format_seconds(hidden_s) if story.blind["detected"] or story.blind["in_sight_s"] > 0 else "the end"
-        parts.append(f"{where} until {until}")
-        if hider and story.rows["detected"].any() and name not in (first["configuration"], last["configuration"]):
-            parts[0] += f", so {name} {_tell_known(story.blind)}"
-    if not story.rows["detected"].any():
-        return (
-            "; ".join([*parts, "no configuration ever knows it" if parts else "No configuration ever knows it"]) + "."
-        )
-    parts.append(f"{last['configuration']} {_tell_known(last)}{_tell_captured(last, story)}")
-    if last["unknown_s"] - first["unknown_s"] > SAME_INSTANT_S:
-        parts.append(f"{first['configuration']} {_tell_known(first)}{_tell_captured(first, story)}")
-    return "; ".join(parts) + "."
+def explain_story(story: ObjectStory) -> str:
+    """What the last configuration had of an object until it knew it, and what the first one had, in one sentence."""
+    first, last = story.first, story.last
+    told = [last, first] if last["unknown_s"] - first["unknown_s"] > SAME_INSTANT_S else [last]
+    return "; ".join(f"{row['configuration']}: {', '.join(_tell_row(story, row))}" for row in told) + "."
 
 
-def _tell_known(row: Any) -> str:
-    if not row["detected"]:
-        return "never knows it"
+def _tell_row(story: ObjectStory, row: Any) -> Iterator[str]:
+    """The clauses of a configuration, in the order of time; seconds are after the onset."""
+    for span in story.spans.get(str(row["configuration"]), ()):
+        if _is_told(span, span.state):
+            to_end = span.end_s >= row["ended_s"] - SAME_INSTANT_S
+            until = "to the end" if to_end else f"until {format_seconds(span.end_s - story.onset_s)}"
+            words = _SPAN_WORDS[span.state].format(body=span.body, unit=span.unit)
+            yield f"{words if span.state != IN_SIGHT or _knows_lists(story, row) else _NOT_COUNTED} {until}"
+    yield from _tell_lists(story, row)
     after_s = float(row["unknown_s"])
-    return f"knows it after {format_seconds(after_s)}" if after_s > SAME_INSTANT_S else "knows it at once"
+    when = f"after {format_seconds(after_s)}" if after_s > SAME_INSTANT_S else "at once"
+    yield f"known {when}{_tell_informing(story, row)}" if row["detected"] else "never known"
 
 
-def _tell_captured(row: Any, story: ObjectStory) -> str:
-    """By which unit's list, what became of lists before it, and how long it took to come."""
-    lost = None if story.lost is None else story.lost.get(str(row["configuration"]), 0)
+_SPAN_WORDS = {
+    NO_UNIT: "no unit there", OUT_OF_VIEW: "out of range or view", HIDDEN: "behind {body} (from {unit})",
+    IN_SIGHT: "in sight, not listed",
+}  # fmt: skip
+"""The words of lanes."""
+
+
+_NOT_COUNTED = "in sight, in no list that counts"
+
+
+def _knows_lists(story: ObjectStory, row: Any) -> bool:
+    """Whether it is known when the object was first listed: by a column, or as the first list makes it known."""
+    by_first = story.study.results.facts[str(row["configuration"])].by_truth_id
+    return not np.isnan(row.get("listed_s", np.nan)) or (by_first and story.drive.experiment.measure.confirm.hits == 1)
+
+
+def _tell_lists(story: ObjectStory, row: Any) -> Iterator[str]:
+    """What became of lists with the object before the one that made it known."""
+    lost, listed_s = None if story.lost is None else story.lost.get(str(row["configuration"]), 0), row.get("listed_s")
     if not row["detected"]:
-        seen = "" if np.isnan(row["in_sight_s"]) else f", though {_tell_sight(story, row['in_sight_s'])}"
-        return f"{seen}; the radio lost {count_noun(lost, 'list')} with it" if lost else seen
-    unit, took_s = row.get("first_unit"), row["detection_s"] - row["captured_s"]
-    told = f" by {unit}" if isinstance(unit, str) and unit else ""
-    listed_s, since_s = float(row.get("listed_s", np.nan)), max(float(row["in_sight_s"]), story.onset_s)
-    if row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= story.onset_s:
+        if lost:
+            yield f"the radio lost {count_noun(lost, 'list')} with it"
+    elif listed_s is not None and row["captured_s"] - listed_s > SAME_INSTANT_S and listed_s >= story.onset_s:
         fate = "the first of these lists were lost, late or held back"
         if lost is not None:
             fate = f"the radio lost {count_noun(lost, 'list')}" if lost else "these lists were late or held back"
         after_s = listed_s - story.onset_s
         since = f"{format_seconds(after_s)} on" if after_s > SAME_INSTANT_S else "the onset on"
-        told += f" (listed from {since}; {fate})"
-    elif row["captured_s"] - since_s > SAME_INSTANT_S:
-        told += f" ({_tell_sight(story, since_s)}, but in no list that counts)"
-    return told + (f", whose list takes {format_seconds(took_s)}" if took_s > SAME_INSTANT_S and told else "")
+        yield f"listed from {since} ({fate})"
 
 
-def _tell_sight(story: ObjectStory, since_s: float) -> str:
-    after_s = max(since_s - story.onset_s, 0.0)
-    return f"in sight from {format_seconds(after_s)} on" if after_s > SAME_INSTANT_S else "in sight from the onset on"
+def _tell_informing(story: ObjectStory, row: Any) -> str:
+    """`, by the ego's own list, which arrives 0.50 s late`."""
+    unit, took_s = row.get("first_unit"), row["detection_s"] - row["captured_s"]
+    if not isinstance(unit, str) or not unit:
+        return ""
+    modelled, scene = story.drive.experiment.modelled, story.drive.scene
+    aboard = unit in modelled and find_carrier(scene, modelled[unit]) == scene.ego_ix >= 0
+    whose = "the ego's own list" if aboard else f"the list of {unit}"
+    return f", by {whose}" + (f", which arrives {format_seconds(took_s)} late" if took_s > SAME_INSTANT_S else "")
 
 
 def format_seconds(time_s: float) -> str:

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Tracks
-from copem_replay.extras.stories.story_facts import ObjectStory, format_seconds, unit_pose, world_at
+from copem_replay.extras.stories.story_facts import (
+    ObjectStory,
+    format_seconds,
+    listed_until_s,
+    unit_pose,
+    world_at,
+)
 from copem_replay.perception.visibility import box_corners
+from copem_replay.pipeline.sight import SightSpan
 from copem_replay.report.figures.selection import pick_evenly
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
 
@@ -30,7 +37,7 @@ _MARGIN_M = 6.0
 """Bodies whose middle is so far outside a plan may still reach into it."""
 
 
-def draw_story(story: ObjectStory, hider: tuple[str, int] | None, said: str) -> Html:
+def draw_story(story: ObjectStory, hider: SightSpan | None, said: str) -> Html:
     """The picture of a story; `said`: its sentence, for screen readers."""
     picture = make_tag(
         "svg", *_draw_plans(story, hider), *_draw_lanes(story), class_="story", role="img", aria_label=said,
@@ -54,7 +61,7 @@ class _View:
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _draw_plans(story: ObjectStory, hider: tuple[str, int] | None) -> Iterator[Html]:
+def _draw_plans(story: ObjectStory, hider: SightSpan | None) -> Iterator[Html]:
     first, last = story.first, story.last
     short = story.short
     known = (
@@ -81,14 +88,14 @@ def _draw_plans(story: ObjectStory, hider: tuple[str, int] | None) -> Iterator[H
         yield make_tag("rect", **frame, fill="none", stroke="#8c8c8c")
 
 
-def _choose_box(
-    story: ObjectStory, worlds: Sequence[Tracks], hider: tuple[str, int] | None
-) -> tuple[float, float, float]:
+def _choose_box(story: ObjectStory, worlds: Sequence[Tracks], hider: SightSpan | None) -> tuple[float, float, float]:
     """West and north end (m) and width (m) of the plans: the object, what hides it, and the ego, if it is near."""
     drive, number = story.drive, story.drive.scene.object_number[story.object_id]
     own = np.concatenate([_places(world, number) for world in worlds])
     kept = [own]
-    others = [_places(world, k) for world in worlds for k in (drive.scene.ego_ix, hider[1] if hider else -1) if k >= 0]
+    others = [
+        _places(world, k) for world in worlds for k in (drive.scene.ego_ix, hider.body_ix if hider else -1) if k >= 0
+    ]
     units = [np.array([at]) for at in drive.fixed_units().values()]
     if len(own):
         kept += [at for at in (*others, *units) if len(at) and np.hypot(*(at - own[0]).T).min() <= _NEAR_M]
@@ -104,9 +111,7 @@ def _places(world: Tracks, object_ix: int) -> Float:
     return np.stack([world.x_m[0, rows], world.y_m[0, rows]], axis=-1)
 
 
-def _draw_plan(
-    story: ObjectStory, world: Tracks, view: _View, row: Any, hider: tuple[str, int] | None
-) -> Iterator[Html]:
+def _draw_plan(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: SightSpan | None) -> Iterator[Html]:
     """Boxes of all bodies, obstacles, units, and the line of who lists it, at the onset of who does not see it."""
     drive, scene = story.drive, story.drive.scene
     yield make_tag("rect", x=f"{view.left}", y=f"{_TOP}", width=f"{_PLAN_W}", height=f"{_PLAN_H}", fill="#f7f7f7")
@@ -117,8 +122,8 @@ def _draw_plan(
         yield make_tag("polygon", points=view.points(outline), fill="#b3b3b3", stroke="#8c8c8c")
     number = scene.object_number[story.object_id]
     looks = {number: (_OBJECT, _OBJECT), scene.ego_ix: ("#4d4d4d", "#262626")}
-    if hider is not None and hider[1] >= 0:
-        looks[hider[1]] = ("#d9d9d9", _HIDER)
+    if hider is not None and hider.body_ix >= 0:
+        looks[hider.body_ix] = ("#d9d9d9", _HIDER)
     corners_m, half_m = box_corners(world), np.array([_PLAN_W, _PLAN_H]) / view.scale / 2
     middle_m = np.array([view.west_m, view.north_m]) + half_m * [1, -1]
     near = (np.abs(corners_m.mean(axis=1) - middle_m) <= half_m + _MARGIN_M).all(axis=1)
@@ -129,8 +134,8 @@ def _draw_plan(
         for corners in corners_m[world.row_object_ix == k]:
             width = "3" if k == number else "2"
             yield make_tag("polygon", points=view.points(corners), fill=fill, stroke=stroke, stroke_width=width)
-    yield from _draw_units(story, world, view, row)
-    labels = {number: story.object_id, scene.ego_ix: "ego", **({hider[1]: hider[0]} if hider else {})}
+    yield from _draw_units(story, world, view, row, hider)
+    labels = {number: story.object_id, scene.ego_ix: "ego", **({hider.body_ix: hider.body} if hider else {})}
     named = [
         (label, np.array([[*map(float, pair.split(","))] for pair in view.points(corners).split()]))
         for k, label in labels.items()
@@ -163,16 +168,16 @@ def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tu
         yield name, *spots[k]
 
 
-def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Iterator[Html]:
+def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: SightSpan | None) -> Iterator[Html]:
+    """Masts, and a line from the unit that lists the object, at the onset from one from which it is hidden then."""
     drive = story.drive
     for at in drive.fixed_units().values():
         x, y = map(float, view.points(np.array([at])).split(","))
         yield make_tag("path", d=f"M{x - 5:.1f},{y + 4:.1f}h10l-5,-9z", fill="#262626")
-    name = story.blind_unit() if row is None else row.get("first_unit")
+    hidden_from = hider.unit if hider and hider.begin_s <= story.onset_s + SAME_INSTANT_S else None
+    name = hidden_from if row is None else row.get("first_unit")
     target = _places(world, drive.scene.object_number[story.object_id])
     if not isinstance(name, str) or name not in drive.experiment.modelled or not len(target):
-        return
-    if row is None and story.hidden_s(story.blind) <= SAME_INSTANT_S:
         return
     if row is not None and not row["detected"]:
         return
@@ -186,7 +191,9 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any) -> Ite
 
 # Lanes: a row per configuration, the soonest first.
 
-_SHADES = {"hidden": "#737373", "in sight": "#bfbfbf", "on its way": "#e0e0e0"}
+_SHADES = {"out of range or view": "#4d4d4d", "hidden": "#808080", "in sight": "#bfbfbf", "on its way": "#e0e0e0"}
+_STATE_SHADES = (*list(_SHADES.values())[:1], *list(_SHADES.values())[:3])
+"""By state of a span; where there is no unit, as out of view."""
 
 
 def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
@@ -208,26 +215,22 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
 
 
 def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: float) -> Iterator[Html]:
-    """Spans of one configuration from the onset on: hidden, in sight, on its way, known; and its time.
+    """Spans of one configuration from the onset on: what its units have of it, on its way, known; and its time.
 
     Known is thicker: some configurations are as grey as what is before.
     """
     known_s, name = story.known_s(row), str(row["configuration"])
-    stages = (
-        [row["in_sight_s"], row["captured_s"], known_s] if row["detected"] else [row["in_sight_s"], known_s, known_s]
-    )
-    stages[0] = story.onset_s + story.hidden_s(row)
-    ends = np.fmin(np.maximum.accumulate(np.nan_to_num(np.array(stages, dtype=float), nan=story.onset_s)), known_s)
-    begin_s = story.onset_s
+    listed_s, until_s = min(listed_until_s(row), known_s), known_s if row["detected"] else story.onset_s
+    spans = [(span.begin_s, min(span.end_s, known_s), _STATE_SHADES[span.state]) for span in story.spans[name]]
+    spans.append((listed_s, until_s, _SHADES["on its way"]))
     thin, thick = ({"y": f"{y + (height - high) / 2:.1f}", "height": f"{high:.1f}"} for high in (height / 2, height))
     yield make_tag(
         "text", story.short[name], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
     )
-    for end_s, shade in zip(ends.tolist(), _SHADES.values(), strict=True):
+    for begin_s, end_s, shade in spans:
         if end_s > begin_s:
             x, width = _LANE_LEFT + (begin_s - story.onset_s) * scale, (end_s - begin_s) * scale
             yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=shade, **thin)
-            begin_s = end_s
     x = _LANE_LEFT + max(known_s - story.onset_s, 0.0) * scale
     if row["detected"]:
         look = story.study.looks[name]

@@ -1,7 +1,8 @@
 """Causes: where the time goes until an object is known, cause by cause, on the same draws.
 
-A replay without any cause of lateness knows every object at its onset wherever there is a unit. Causes come back one by
-one, in the order in which they act (a chain); what is added is the share of each, so that shares sum to the mean time
+Until an object is listed, the time in which it is out of range or view, and that in which it is hidden, are those of
+the lanes of viewers: states of units at the frames of the truth. Other causes come back one by one, in the order in
+which they act (a chain); what each adds of the remaining time is its share, so that shares sum to the mean time
 unknown. Beside it stands what would be gained if only that cause were gone, which does not sum. Definitions:
 docs/guide/why.md.
 """
@@ -29,6 +30,7 @@ from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.onset import select_counted
+from copem_replay.metrics.sight import measure_sight
 from copem_replay.metrics.survival import compute_unknown_s
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.detection import DetectionModel
@@ -160,10 +162,10 @@ class Cause:
 
 
 CAUSES = (
+    Cause("range", "sensor", "out of range or view", lambda e: change_pems(e, _widen)),
     Cause("hidden", "line of sight", "hidden by other bodies", _show_all),
     Cause("rate", "unit", "between two lists of a unit", _list_all_frames),
     Cause("outages", "unit", "outages of units", lambda e: _change_units(e, outages=None)),
-    Cause("range", "sensor", "out of range or view", lambda e: change_pems(e, _widen)),
     Cause("missed", "sensor", "missed in sight", lambda e: change_pems(e, change_couples(_list_whatever_shows))),
     Cause("memory", "sensor", "missed in list after list", lambda e: change_pems(e, _forget)),
     Cause("processing", "unit", "processing of units", lambda e: _change_units(e, ready=None)),
@@ -179,6 +181,10 @@ CAUSES = (
     Cause("ghosts", "fusion", "ghosts", lambda e: change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),
 )  # fmt: skip
 """The causes in the order in which they act."""
+_SIGHT = ("range", "hidden")
+"""The causes whose time is added up from the states of units."""
+_BEFORE_LISTED = ("rate", "outages", "missed", "memory")
+"""Causes whose time is before the object is listed: what of it is `_SIGHT` is not theirs."""
 NO_UNIT = "no unit there"
 """What is left without any cause: there is no unit, or it does not list its own carrier."""
 RECORDED = "recorded"
@@ -188,6 +194,7 @@ LEFT = {
     RECORDED: Cause(RECORDED, RECORDED, "not in a recorded list", lambda e: e),
 }
 """What is left without any cause."""
+_ORDER = (*LEFT.values(), *CAUSES)
 _OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
 """Causes of a configuration with recorded units: what these would list otherwise is not known."""
 
@@ -313,6 +320,27 @@ class Counterfactuals:
             self._found[key] = rows["unknown_s"].to_numpy(dtype=float)
         return self._found[key]
 
+    def sight_s(self, gone: Sequence[Cause], after_s: Float) -> dict[str, Float]:
+        """By cause of `_SIGHT` seconds (n,) of the first `after_s` (n,) after the onset of each row that counts.
+
+        `gone`: all other causes, so that units list every frame of the truth.
+        """
+        experiment, rows = reduce(lambda one, cause: cause.remove(one), gone, self.only), self.rows
+        ready = self._find_ready(experiment)
+        expanded, episodes = ready.expand(experiment), ready.episodes
+        (one,) = expanded.configurations.values()
+        ids = [ready.scene.object_ids[k] for k in episodes.object_ix]
+        places = {key: place for place, key in enumerate(zip(ids, episodes.number.tolist(), strict=True))}
+        place = np.array([places[key] for key in zip(rows["object_id"], rows["episode"], strict=True)], dtype=np.int64)
+        runs, run = np.unique(rows["run"], return_inverse=True)
+        until_s = np.zeros((len(runs), len(ids)))
+        until_s[run, place] = rows["onset_s"] + after_s
+        equipped = expanded.equipped(ready.scene.log, runs)
+        there = np.ones((1, len(expanded.units)), dtype=bool) if equipped is None else equipped
+        found = measure_sight(ready.sight_spans, expanded, expanded.units_of(one), there, until_s)
+        seconds = {"range": found.out_of_view_s, "hidden": found.hidden_s}
+        return {name: np.broadcast_to(of, until_s.shape)[run, place] for name, of in seconds.items()}
+
     def _find_ready(self, experiment: Experiment) -> Replay:
         """The log made ready for an experiment; what is observed is kept while there is room for it."""
         key = experiment.model_dump_json(exclude={"configurations", "links"})
@@ -350,16 +378,23 @@ class CauseShares:
 
 def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
     """What each acting cause adds to the time unknown of every row; the rows of `added_s` sum to it."""
-    causes = list_causes(replays.only)
-    known = replays.unknown_s(causes)
-    shares = [CauseShares(LEFT[RECORDED if replays.only.recorded else NO_UNIT], known, None)]
-    whole = replays.unknown_s(())
-    for k, cause in enumerate(causes):
-        later = replays.unknown_s(causes[k + 1 :])
-        gained_s = whole - replays.unknown_s([cause])
-        shares.append(CauseShares(cause, later - known, gained_s))
-        known = later
-    return shares
+    causes, recorded = list_causes(replays.only), bool(replays.only.recorded)
+    chain, whole = [cause for cause in causes if cause.name not in _SIGHT], replays.unknown_s(())
+
+    def sight_s(after_s: Float) -> dict[str, Float]:
+        return dict.fromkeys(_SIGHT, np.zeros_like(after_s)) if recorded else replays.sight_s(chain, after_s)
+
+    known = replays.unknown_s(chain)
+    sight = sight_s(known)
+    added = {RECORDED if recorded else NO_UNIT: known - sum(sight.values())}
+    for k, cause in enumerate(chain):
+        later = replays.unknown_s(chain[k + 1 :])
+        then = sight_s(later) if cause.name in _BEFORE_LISTED else sight
+        added[cause.name] = later - known - sum(then[name] - sight[name] for name in _SIGHT)
+        known, sight = later, then
+    added |= {name: of for name, of in sight.items() if of.any() or any(cause.name == name for cause in causes)}
+    gained = {cause.name: whole - replays.unknown_s([cause]) for cause in causes}
+    return [CauseShares(one, added[one.name], gained.get(one.name)) for one in _ORDER if one.name in added]
 
 
 def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]) -> pd.DataFrame:
@@ -369,7 +404,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
     """
     rows = pd.concat([replays.rows for replays, _ in of_logs], ignore_index=True)
     names = dict.fromkeys(name_cause(one) for _, shares in of_logs for one in shares)
-    order = [*LEFT, *(cause.name for cause in CAUSES)]
+    order = [cause.name for cause in _ORDER]
     table = []
     for name in sorted(names, key=order.index):
         found = [_find(shares, name) for _, shares in of_logs]
@@ -398,7 +433,7 @@ def name_cause(share: CauseShares) -> str:
 
 def describe_cause(name: str) -> str:
     """A cause in the words of pages and terminals."""
-    return next((cause.words for cause in (*LEFT.values(), *CAUSES) if cause.name == name), name)
+    return next((cause.words for cause in _ORDER if cause.name == name), name)
 
 
 def _find(shares: Sequence[CauseShares], name: str) -> CauseShares | None:

@@ -13,12 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int
+from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int
 from copem_replay.extras.why.causes import CAUSES, LEFT, CauseShares, Counterfactuals, name_cause
-from copem_replay.perception.observation import interpolate_worlds
-from copem_replay.perception.sensor_poses import make_observers
-from copem_replay.perception.visibility import find_blockers
+from copem_replay.perception.observation import HIDDEN
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.sight import compute_sight, list_sight_spans
 
 LATE_S = 1.0
 """An episode that is unknown for longer is late: on fourteen recorded drives, four fifths of all seconds."""
@@ -120,24 +119,17 @@ def find_places(replay: Replay, episodes: pd.DataFrame) -> list[tuple[str, str]]
 
 
 def _find_bodies(replay: Replay, objects: Int, begin_s: Float, until_s: Float) -> list[str]:
-    scene, placed, experiment = replay.scene, replay.placed, replay.expanded
-    solids = len(placed.solids)
-    counts = np.zeros((len(objects), len(scene.object_ids) + solids), dtype=np.int64)
-    first_s, last_s = float(begin_s.min()), float(until_s.max()) + SAME_INSTANT_S
-    for names, world in interpolate_worlds(scene, replay.truth, experiment, placed, first_s, last_s):
-        carriers = np.array([placed.carrier_ix[name] for name in names])
-        watching = make_observers([placed.poses[name] for name in names], carriers)
-        body = find_blockers(world, placed.static, watching, experiment.visibility)
-        captured_s = world.row_captured_s
-        for m, number in enumerate(objects.tolist()):
-            rows = np.flatnonzero(world.row_object_ix == number)
-            rows = rows[(captured_s[rows] >= begin_s[m]) & (captured_s[rows] <= until_s[m])]
-            found = body[:, rows].ravel()
-            np.add.at(counts[m], world.row_object_ix[found[found >= 0]], 1)
-            np.add.at(counts[m], len(scene.object_ids) - 2 - found[found < -1], 1)
-    words = [f"{CLASSES[kind]} {name}" for kind, name in zip(scene.object_class, scene.object_ids, strict=True)]
-    words += [solid.name for solid in placed.solids]
-    return [words[int(of.argmax())] if of.any() else "" for of in counts]
+    """The words of lanes: who hides each object longest from the units that have it in view."""
+    (one,) = replay.expanded.configurations.values()
+    names, shown = replay.expanded.units_of(one), list(dict.fromkeys(objects.tolist()))
+    sight, words = compute_sight(replay, replay.expanded, shown), []
+    for k, *between_s in zip(objects.tolist(), begin_s.tolist(), until_s.tolist(), strict=True):
+        lasts_s: dict[str, float] = {}
+        for span in list_sight_spans(replay, sight, shown.index(k), names, *between_s):
+            if span.state == HIDDEN:
+                lasts_s[span.body] = lasts_s.get(span.body, 0.0) + span.end_s - span.begin_s
+        words.append(max(lasts_s, key=lambda body: lasts_s[body], default=""))
+    return words
 
 
 def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:

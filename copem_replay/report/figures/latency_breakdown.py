@@ -9,9 +9,10 @@
 | fusion | arrival | the fused list with which it is known (`detection_s`) |
 
 Means are over the detected rows, so that stages add up. Until it is listed, an object is out of range or view of all of
-the configuration's units, or hidden from those that have it in view (`out_of_view_s`, `hidden_s`), or in sight. Only the newest capture of a confirmation is known, so the time of a confirmation, and that in which
-another unit's list of the object is on its way, belong to *listed* where the instants of lists on their way are known
-(`WAY` in `metrics/detections_table.py`), and to *in sight* elsewhere.
+the configuration's units, or hidden from those that have it in view (`out_of_view_s`, `hidden_s`), or in sight. Only
+the newest capture of a confirmation is known, so the time of a confirmation, and that in which another unit's list of
+the object is on its way, belong to *listed* where the instants of lists on their way are known (`WAY` in
+`metrics/detections_table.py`), and to *in sight* elsewhere.
 
 Without these instants, ideal fusion and the truth know an object from the list that brings it (one hit): all time from
 the capture on is transport. Otherwise transport is the latency if all units have one latency; if not, transport and
@@ -59,8 +60,8 @@ STAGES = {
     OUT_OF_VIEW: "from the start of the clock until its first list: out of range or view of all of the configuration's "
     "units",
     HIDDEN: "in that time: within range and view of a unit, and hidden from all that have it there",
-    IN_SIGHT: "the rest of that time: missed by the perception, between two lists, and, where it is not known when it was "
-    "first listed, not yet confirmed, or in a list that was still on its way",
+    IN_SIGHT: "the rest of that time: missed by the perception, between two lists, and, where it is not known when it "
+    "was first listed, not yet confirmed, or in a list that was still on its way",
     UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
     "sight: the truth needs no sight, and recorded units do not tell",
     LISTED: "where lists come by a link, or of units with ready or sends, the last part of that time: from the capture "
