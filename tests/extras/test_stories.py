@@ -54,8 +54,8 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
     study = load_study(hidden)
     [_, story] = story_parts(study)
     said = re.sub(r"<svg.*</svg>", "", story, flags=re.DOTALL)
-    assert "Hidden from ego behind car 9 until " in said
-    assert "half knows it after 0.30 s by mast, whose list takes 0.30 s." in said
+    assert "late: behind car 9 (from ego) until " in said
+    assert "half: known after 0.30 s, by the list of mast, which arrives 0.30 s late." in said
     assert "copem-replay view FOLDER --object 3" not in said, "no run is shown"
     assert 'viewBox="0 0 960 360"' in story
 
@@ -100,8 +100,8 @@ def test_the_sentence_counts_lists_that_the_radio_lost(tmp_path: Path) -> None:
     lost = round((row.captured_s - row.onset_s) / 0.1)
     assert lost > 1
     words = Page(build_page(load_study(folder))).words
-    assert f"half knows it after {row.time_to_detection_s:.2f} s by ego (listed from the onset on; " in words
-    assert f"the radio lost {lost} lists)" in words
+    known = f"known after {row.time_to_detection_s:.2f} s, by the ego's own list"
+    assert f"half: listed from the onset on (the radio lost {lost} lists), {known}" in words
 
 
 def test_lists_that_cannot_be_counted_are_not_said_to_be_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +115,7 @@ def test_lists_that_cannot_be_counted_are_not_said_to_be_late(tmp_path: Path, mo
     folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *changes, *ALONE))
     monkeypatch.setattr(story_facts, "replay_again", differs)
     words = Page(build_page(load_study(folder))).words
-    assert "(listed from the onset on; the first of these lists were lost, late or held back)" in words
+    assert "listed from the onset on (the first of these lists were lost, late or held back)" in words
     assert "the radio lost" not in words
 
 

@@ -109,9 +109,7 @@ def test_what_does_not_count_is_said(tmp_path: Path) -> None:
     near = ("onset: {kind: at, time_s: 0.5}", "onset: {kind: in_range, range_m: 31}")
     page = Page(build_page(load_study(replayed(tmp_path, changed(near)))))
     said = "1 measured object, 6 runs, so 6 rows for each configuration; common random numbers per run (seed 1). "
-    said += (
-        "Beside them 1 episode does not count: what counts began crossed or appeared, and has a frame after its onset."
-    )
+    said += "1 more object was in range when the recording began; it does not count."
     assert said in page.words
 
 

@@ -10,12 +10,15 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.window import describe_window
+from copem_replay.metrics.onset import BEGAN, LOG_START, is_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.perception.pem.model import Pem
 from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
 from copem_replay.report.html.tables import row_head
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from copem_replay.report.html.study import ReportData
     from copem_replay.results.read import Results
 
@@ -217,19 +220,28 @@ def describe_setting(study: ReportData) -> str:
     episodes = results.known.groupby(["log", "object_id", "episode"]).ngroups
     times = f" with {count_noun(episodes, 'episode')}" if episodes > things else ""
     tally = results.tally[results.tally["event"] == DETECTED]
-    left = tally.groupby(["log", "object_id", "episode"]).ngroups - episodes
-    others = (
-        f" Beside them {count_noun(left, 'episode')} {'does' if left == 1 else 'do'} not count: what counts began "
-        f"{' or '.join(experiment.measure.began)}, and has a frame after its onset."
-    )
+    left = tally[~is_counted(tally, experiment.measure.began)].drop_duplicates(["log", "object_id", "episode"])
     rows = int(results.known["runs"].sum()) // len(study.names)
     confirm = experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
         f"{count_noun(things, 'measured object')}{times}, {count_noun(experiment.runs, 'run')}, so "
         f"{count_noun(rows, 'row')} for each configuration; common random numbers per run (seed {experiment.seed})."
-        f"{others if left else ''} "
+        f"{_describe_others(experiment, left) if len(left) else ''} "
         f"The clock of an object starts {_describe_onset(experiment)}.{hits}{describe_unit_errors(experiment)}"
+    )
+
+
+def _describe_others(experiment: Experiment, left: pd.DataFrame) -> str:
+    """Episodes that do not count, one row each: how many, and why: most were there when the recording began."""
+    what, one = "object" if left["episode"].max() == 0 else "episode", len(left) == 1
+    where = "in range" if experiment.measure.onset.kind == "in_range" else "there"
+    if (left["began"] == BEGAN[LOG_START]).all() and BEGAN[LOG_START] not in experiment.measure.began:
+        was, them = ("was", "it does") if one else ("were", "they do")
+        return f" {len(left)} more {what}{'' if one else 's'} {was} {where} when the recording began; {them} not count."
+    return (
+        f" {len(left)} more {what}{'' if one else 's'} {'does' if one else 'do'} not count: what counts began "
+        f"{' or '.join(experiment.measure.began)}, and has a frame after its onset."
     )
 
 
