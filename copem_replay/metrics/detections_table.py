@@ -27,8 +27,8 @@ from copem_replay.metrics.config import MetricsSetup
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.episodes import Episodes, Reference, locate_reference
 from copem_replay.metrics.onset import began_texts
-from copem_replay.metrics.sight import SightTimes
 from copem_replay.metrics.survival import end_reason_texts
+from copem_replay.perception.sight import SightTimes
 from copem_replay.perception.visibility import rectangle_corners
 
 if TYPE_CHECKING:

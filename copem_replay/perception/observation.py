@@ -263,7 +263,7 @@ def _assess_rows(
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         pem = experiment.pems[str(unit.pem)].couples
-        couple_ix[rows], probability[rows] = _assess_view(str(unit.pem), experiment, view.take(rows), tags)
+        couple_ix[rows], probability[rows] = assess_view(str(unit.pem), experiment, view.take(rows), tags)
         for c, couple in enumerate(pem):
             of_couple = rows[couple_ix[rows] == c]
             if len(of_couple):
@@ -273,7 +273,7 @@ def _assess_rows(
     return couple_ix, probability, existence
 
 
-def _assess_view(
+def assess_view(
     pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags: Mapping[str, str]
 ) -> tuple[Int, Float]:
     """Of each row (P,) of a view the couple of the PEM that applies, and its probability: 0 where none does."""
@@ -286,29 +286,6 @@ def _assess_view(
                 couple.detection, view.take(rows), f"pems.{pem}[{c}].detection"
             )
     return couple_ix, probability
-
-
-# What a unit has of an object at an instant: one meaning of *in sight*, for tables, viewer, stories and causes.
-
-NO_UNIT, OUT_OF_VIEW, HIDDEN, IN_SIGHT = range(4)
-"""The better the higher: of several units the best counts. No unit: it is not there, or the object carries it."""
-
-
-def judge_sight(pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags: Mapping[str, str]) -> Int:
-    """(P,) what a unit with this PEM has of the objects of a view: out of range or view, hidden, or in sight.
-
-    In sight: some of it shows, and its couple lists it with any probability. Hidden: it would, were nothing between.
-    A visible share of NaN, where no couple can apply at any share, is out of view.
-    """
-    state = np.full(len(view.range_m), OUT_OF_VIEW)
-    with np.errstate(invalid="ignore"):
-        shows = view.visible_share > 0
-    rows = np.flatnonzero(shows)
-    state[rows[_assess_view(pem, experiment, view.take(rows), tags)[1] > 0]] = IN_SIGHT
-    rows = np.flatnonzero((state != IN_SIGHT) & ~np.isnan(view.visible_share))
-    clear = replace(view.take(rows), visible_share=np.ones(len(rows)))
-    state[rows[_assess_view(pem, experiment, clear, tags)[1] > 0]] = HIDDEN
-    return state
 
 
 def rows_by_unit(tracks: Tracks) -> list[Int]:

@@ -50,9 +50,9 @@ from copem_replay.metrics.episodes import (
     locate_reference,
     measured_objects,
 )
-from copem_replay.metrics.sight import SightSpans, find_sight_changes, join_sight_changes
 from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
+from copem_replay.perception.sight import SightSpans, find_sight_changes, join_sight_changes
 from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment
 
 T = TypeVar("T")
@@ -248,10 +248,11 @@ class Replay:
         changes, met, rows = [], list[Bool](), 0
         for chunk in self.chunks:
             observations = self.observe(chunk)
-            changes.append(find_sight_changes(observations, self.expanded, self.scene.tags, self.episodes))
+            numbers = self.episodes.number_rows(observations.tracks)
+            changes.append(find_sight_changes(observations, self.expanded, self.scene.tags, numbers))
             met.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
-        return join_sight_changes(changes, self.episodes), np.any(met, axis=0), rows
+        return join_sight_changes(changes, self.episodes.onset_s), np.any(met, axis=0), rows
 
     @cached_property
     def truth_cache(self) -> TruthCache:

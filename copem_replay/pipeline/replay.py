@@ -26,7 +26,7 @@ from copem_replay.metrics.detections_table import (
     pick_list_times,
     stack_events,
 )
-from copem_replay.metrics.sight import measure_sight
+from copem_replay.perception.sight import measure_sight
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.pipeline.receiver import Receivers, states_needed

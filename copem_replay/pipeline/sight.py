@@ -1,13 +1,14 @@
 """Sight at the frames of the truth: what every modelled unit has of some objects, and the body that hides most of them.
 
 Lanes, stories and causes name what they name from here. Columns of tables come from the same states, at the lists of
-units (`metrics/sight.py`).
+units (`perception/sight.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from copem_replay.core.interpolation import interpolate_at_instants
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, SAME_INSTANT_S, Bool, Float, Int, Scene, Solid, Tracks
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.schema import Experiment, Unit
-from copem_replay.perception.observation import HIDDEN, NO_UNIT, Observations, compute_view, judge_sight
+from copem_replay.perception.observation import Observations, compute_view
 from copem_replay.perception.pem.condition import Condition, Couple, may_apply
 from copem_replay.perception.sensor_poses import (
     UnitPoses,
@@ -26,12 +27,13 @@ from copem_replay.perception.sensor_poses import (
     make_observers,
     unit_ground,
 )
+from copem_replay.perception.sight import HIDDEN, NO_UNIT, judge_sight
 from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 
 ABSENT = -1
-"""The state of an object that is not in the log; others are those of `perception/observation.py`."""
+"""The state of an object that is not in the log; others are those of `perception/sight.py`."""
 
 ROWS_AT_ONCE = 60_000
 """Rows of the world that are looked at together. It changes time and memory alone."""
@@ -70,6 +72,48 @@ class Sight:
         return by, body
 
 
+# Spans, as lanes show and stories tell them.
+
+STEADY_S = 0.4
+"""Shorter spans become part of those around them: their words could not be read."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """The prevailing status of the instants `first` to `end`, without `end`."""
+
+    first: int
+    end: int
+    status: int
+
+
+def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, kept: int = -1) -> list[Span]:
+    """The spans of a status (K,) until `end_ns`, none shorter than `STEADY_S`; 0: the object is absent.
+
+    A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
+    too short as a whole continues the span before, unless the object is absent then. The first span of the
+    status `kept` stays, however short.
+    """
+    steady_ns = round(STEADY_S * 1e9)
+    first = np.flatnonzero(np.diff(status, prepend=-1))
+    values, lasts = status[first], np.diff(elapsed_ns[first], append=end_ns or elapsed_ns[-1] + steady_ns)
+    long_enough = lasts >= steady_ns
+    long_enough[np.flatnonzero(values == kept)[:1]] = True
+    spans: list[Span] = []
+    k = 0
+    while k < len(first):
+        end = k + 1
+        if not long_enough[k]:
+            end = next((n for n in range(k, len(first)) if long_enough[n]), len(first))
+        duration_by_status = np.bincount(values[k:end], weights=lasts[k:end])
+        alone = not spans or spans[-1].status == 0
+        if long_enough[k] or alone or duration_by_status.sum() >= steady_ns:
+            spans.append(Span(int(first[k]), len(status), int(duration_by_status.argmax())))
+        k = end
+    merged = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]
+    return [replace(span, end=after.first) for span, after in pairwise([*merged, Span(len(status), 0, 0)])]
+
+
 @dataclass(frozen=True)
 class SightSpan:
     """A time from `begin_s` to `end_s`, seconds since the log's start, in which the units of a configuration have an
@@ -97,17 +141,16 @@ def list_sight_spans(
     if not units or not len(frames):
         return []
     state, unit_ix = (values[frames] for values in sight.find_best(units, m))
+    begins_ns = np.maximum(sight.elapsed_ns[frames], round(from_s * 1e9))
     bodies, spans = name_bodies(replay.scene, sight.solids, replay.scene.object_ids), list[SightSpan]()
-    cuts = np.flatnonzero(np.diff(state)) + 1
-    for some in np.split(np.arange(len(frames)), cuts):
-        begin_s = max(float(time_s[frames[some[0]]]), from_s)
-        after = some[-1] + 1
-        end_s = float(time_s[frames[after]]) if after < len(frames) else until_s
+    for span in smooth_status(begins_ns, state - ABSENT, end_ns=round(until_s * 1e9)):
+        end_s = until_s if span.end == len(frames) else float(begins_ns[span.end]) * 1e-9
         what: dict[str, Any] = {}
-        if (of := int(state[some[0]])) == HIDDEN:
-            by, body_ix = sight.find_hider(unit_ix[some], frames[some], m)
+        if (of := span.status + ABSENT) == HIDDEN:
+            of_span = np.arange(span.first, span.end)[state[span.first : span.end] == HIDDEN]
+            by, body_ix = sight.find_hider(unit_ix[of_span], frames[of_span], m)
             what = {"unit": every[by], "body": bodies[body_ix], "body_ix": body_ix}
-        spans.append(SightSpan(of, begin_s, end_s, **what))
+        spans.append(SightSpan(of, float(begins_ns[span.first]) * 1e-9, end_s, **what))
     return spans
 
 

@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +25,7 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.sight import Sight, name_bodies
+from copem_replay.pipeline.sight import Sight, Span, name_bodies, smooth_status
 from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
     ABSENT,
@@ -49,8 +48,6 @@ from copem_replay.viewer.sink import (
 from copem_replay.viewer.sink import LOST as LIST_LOST
 from copem_replay.viewer.status import EpisodeClocks, Status, lane_text
 
-STEADY_S = 0.4
-"""Shorter spans become part of those around them: their words could not be read."""
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
 FLAG = 6
@@ -63,16 +60,6 @@ WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
 MOST_NAME = 0.52
 """Most of a lane's width that is before the onset, for the name."""
-_STEADY_NS = round(STEADY_S * 1e9)
-
-
-@dataclass(frozen=True)
-class Span:
-    """The prevailing status of the instants `first` to `end`, without `end`."""
-
-    first: int
-    end: int
-    status: int
 
 
 def write_lanes(
@@ -91,7 +78,7 @@ def write_lanes(
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
-            spans = smooth_status(status.elapsed_ns, status.status[:, m])
+            spans = smooth_status(status.elapsed_ns, status.status[:, m], kept=KNOWN)
             texts = [_span_text(bodies, units, sight, status, m, span) for span in spans]
             begins = status.elapsed_ns[[span.first for span in spans]]
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
@@ -152,7 +139,7 @@ def is_briefly_known(statuses: Iterable[Status], m: int, axis_s: tuple[float, fl
     """Whether any lane of object m has a first span of known that is too short for its time on an axis."""
     least_ns = FLAG * MARK * (axis_s[1] - axis_s[0]) * 1e9
     for status in statuses:
-        for span in smooth_status(status.elapsed_ns, status.status[:, m]):
+        for span in smooth_status(status.elapsed_ns, status.status[:, m], kept=KNOWN):
             if span.status == KNOWN:
                 end = min(span.end, len(status.elapsed_ns) - 1)
                 if end == span.end and status.elapsed_ns[end] - status.elapsed_ns[span.first] < least_ns:
@@ -209,32 +196,6 @@ def _shorten_words(text: str) -> Iterator[str]:
     yield text.replace("range or ", "").removesuffix(" list")
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
-
-
-def smooth_status(elapsed_ns: Int, status: Int) -> list[Span]:
-    """The spans of a status (K,), none shorter than `STEADY_S`.
-
-    A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
-    too short as a whole continues the span before, unless the object is absent then. The first span in which the object
-    is known stays, however short.
-    """
-    first = np.flatnonzero(np.diff(status, prepend=-1))
-    values, lasts = status[first], np.diff(elapsed_ns[first], append=elapsed_ns[-1] + _STEADY_NS)
-    long_enough = lasts >= _STEADY_NS
-    long_enough[np.flatnonzero(values == KNOWN)[:1]] = True
-    spans: list[Span] = []
-    k = 0
-    while k < len(first):
-        end = k + 1
-        if not long_enough[k]:
-            end = next((n for n in range(k, len(first)) if long_enough[n]), len(first))
-        duration_by_status = np.bincount(values[k:end], weights=lasts[k:end])
-        alone = not spans or spans[-1].status == ABSENT
-        if long_enough[k] or alone or duration_by_status.sum() >= _STEADY_NS:
-            spans.append(Span(int(first[k]), len(status), int(duration_by_status.argmax())))
-        k = end
-    merged = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]
-    return [replace(span, end=after.first) for span, after in pairwise([*merged, Span(len(status), 0, 0)])]
 
 
 def _span_text(

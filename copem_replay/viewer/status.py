@@ -34,8 +34,8 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_NS, TRUTH, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.perception.observation import HIDDEN as IS_HIDDEN
-from copem_replay.perception.observation import IN_SIGHT, OUT_OF_VIEW
+from copem_replay.perception.sight import HIDDEN as IS_HIDDEN
+from copem_replay.perception.sight import IN_SIGHT, OUT_OF_VIEW
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import Sight, name_bodies
 from copem_replay.viewer.camera import below_bodies

@@ -13,8 +13,17 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import read_log
-from copem_replay.metrics.sight import SightSpans, find_sight_changes, join_sight_changes, measure_sight
-from copem_replay.perception.observation import HIDDEN, IN_SIGHT, NO_UNIT, OUT_OF_VIEW, observe_objects
+from copem_replay.perception.observation import observe_objects
+from copem_replay.perception.sight import (
+    HIDDEN,
+    IN_SIGHT,
+    NO_UNIT,
+    OUT_OF_VIEW,
+    SightSpans,
+    find_sight_changes,
+    join_sight_changes,
+    measure_sight,
+)
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.run import run_experiment
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -144,8 +153,8 @@ def test_what_nothing_reads_is_not_computed_and_nothing_else_changes() -> None:
     every = observe_objects(replay.scene, replay.truth, replay.expanded, replay.placed)
     for name in ("couple_ix", "probability", "existence"):
         assert np.array_equal(getattr(found, name), getattr(every, name)), name
-    changes = [find_sight_changes(every, replay.expanded, replay.scene.tags, replay.episodes)]
-    spans = join_sight_changes(changes, replay.episodes)
+    changes = [find_sight_changes(every, replay.expanded, replay.scene.tags, replay.episodes.number_rows(every.tracks))]
+    spans = join_sight_changes(changes, replay.episodes.onset_s)
     for name in SightSpans.__dataclass_fields__:
         assert np.array_equal(getattr(replay.sight_spans, name), getattr(spans, name)), name
     assert np.bincount(spans.state, minlength=4)[[OUT_OF_VIEW, HIDDEN, IN_SIGHT]].min() > 1

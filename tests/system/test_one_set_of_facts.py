@@ -237,4 +237,5 @@ def test_no_two_outputs_name_different_causes(name: str, tmp_path: Path) -> None
             spent = sum_of(story, "seen")
             if spent >= LEAST_S:
                 assert sum(why.get(cause, 0.0) for cause in SEEN) >= spent - LEAST_S, where
-    assert compared > 0
+    assert told
+    assert compared > 0 or name in ("tc016d", "nuscenes_scene0916"), "whose objects are in sight at once"

@@ -23,12 +23,13 @@ from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
+from copem_replay.pipeline.sight import STEADY_S, smooth_status
 from copem_replay.results.shown_objects import axis_s, choose_shown_objects
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.camera import camera_following, camera_on_ego, include_places
 from copem_replay.viewer.curves import break_lines, running_median
-from copem_replay.viewer.lanes import STEADY_S, lanes_axis_s, smooth_status
+from copem_replay.viewer.lanes import lanes_axis_s
 from copem_replay.viewer.sensors import watching_places
 from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_seconds
 from tests.helpers.report_pages import named
@@ -318,7 +319,7 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
     """Tenths of a second each status lasts: spans are long, or the first of all, or the first known."""
     lasts, what = np.array([r for r, _ in runs]), np.array([s for _, s in runs])
     elapsed = np.append(0, np.cumsum(lasts)[:-1]) * 100_000_000
-    spans = smooth_status(elapsed, what)
+    spans = smooth_status(elapsed, what, kept=KNOWN)
     assert spans[0].first == 0
     assert spans[-1].end == len(what)
     assert all(a.end == b.first and a.status != b.status for a, b in pairwise(spans))
@@ -335,7 +336,7 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
 
 def test_what_is_short_after_an_absence_is_no_absence() -> None:
     """Absent for 1 s, hidden for 0.3 s, known from then on."""
-    spans = smooth_status(np.array([0, 10, 13]) * 100_000_000, np.array([ABSENT, HIDDEN, KNOWN]))
+    spans = smooth_status(np.array([0, 10, 13]) * 100_000_000, np.array([ABSENT, HIDDEN, KNOWN]), kept=KNOWN)
     assert [(span.first, span.status) for span in spans] == [(0, ABSENT), (1, HIDDEN), (2, KNOWN)]
 
 

@@ -15,8 +15,8 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_at_instants
 from copem_replay.core.tracks import SAME_INSTANT_S, Tracks
 from copem_replay.experiment.schema import Unit
-from copem_replay.perception.observation import HIDDEN, IN_SIGHT, NO_UNIT, OUT_OF_VIEW
 from copem_replay.perception.sensor_poses import UnitPoses, compute_unit_poses, find_carrier, unit_ground
+from copem_replay.perception.sight import HIDDEN, IN_SIGHT, NO_UNIT, OUT_OF_VIEW
 from copem_replay.pipeline.one_run import replay_run
 from copem_replay.pipeline.sight import SightSpan, compute_sight, list_sight_spans
 from copem_replay.report.figures.paths import Drive

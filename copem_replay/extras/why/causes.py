@@ -30,11 +30,11 @@ from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.config import Confirm
 from copem_replay.metrics.onset import select_counted
-from copem_replay.metrics.sight import measure_sight
 from copem_replay.metrics.survival import compute_unknown_s
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.pem.detection import DetectionModel
 from copem_replay.perception.pem.model import Pem
+from copem_replay.perception.sight import measure_sight
 from copem_replay.perception.visibility import Observers, Statics, VisibilityModel
 from copem_replay.pipeline.expansion import expand_experiment
 from copem_replay.pipeline.prepare import ROWS_AT_ONCE, Replay, prepare_log

@@ -15,7 +15,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int
 from copem_replay.extras.why.causes import CAUSES, LEFT, CauseShares, Counterfactuals, name_cause
-from copem_replay.perception.observation import HIDDEN
+from copem_replay.perception.sight import HIDDEN
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import compute_sight, list_sight_spans
 

@@ -1,22 +1,42 @@
-"""Sight spans: what the units of a configuration have of each episode, from the onset on, from list to list.
+"""Sight: what units have of an object, in one meaning of *in sight* for tables, viewers, stories and causes.
 
-The states are those of `perception/observation.py`, and of several units the best counts. What a list tells holds until
-the unit's next one; what the first after the onset tells holds from the onset on, unless it is in sight, which begins
-with that list.
+Spans are of episodes, from the onset on, from list to list; of several units the best counts. What a list tells holds
+until the unit's next one; what the first after the onset tells holds from the onset on, unless it is in sight, which
+begins with that list.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float, Int
-from copem_replay.metrics.config import MetricsSetup
-from copem_replay.metrics.episodes import Episodes
-from copem_replay.perception.observation import HIDDEN, IN_SIGHT, OUT_OF_VIEW, Observations, judge_sight, rows_by_unit
+from copem_replay.core.view_geometry import ViewGeometry
+from copem_replay.perception.config import PerceptionSetup
+from copem_replay.perception.observation import Observations, assess_view, rows_by_unit
+
+NO_UNIT, OUT_OF_VIEW, HIDDEN, IN_SIGHT = range(4)
+"""The better the higher: of several units the best counts. No unit: it is not there, or the object carries it."""
+
+
+def judge_sight(pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags: Mapping[str, str]) -> Int:
+    """(P,) what a unit with this PEM has of the objects of a view: out of range or view, hidden, or in sight.
+
+    In sight: some of it shows, and its couple lists it with any probability. Hidden: it would, were nothing between.
+    A visible share of NaN, where no couple can apply at any share, is out of view.
+    """
+    state = np.full(len(view.range_m), OUT_OF_VIEW)
+    with np.errstate(invalid="ignore"):
+        shows = view.visible_share > 0
+    rows = np.flatnonzero(shows)
+    state[rows[assess_view(pem, experiment, view.take(rows), tags)[1] > 0]] = IN_SIGHT
+    rows = np.flatnonzero((state != IN_SIGHT) & ~np.isnan(view.visible_share))
+    clear = replace(view.take(rows), visible_share=np.ones(len(rows)))
+    state[rows[assess_view(pem, experiment, clear, tags)[1] > 0]] = HIDDEN
+    return state
 
 
 @dataclass(frozen=True)
@@ -77,11 +97,10 @@ class SightChanges(NamedTuple):
 
 
 def find_sight_changes(
-    observations: Observations, experiment: MetricsSetup, tags: Mapping[str, str], episodes: Episodes
+    observations: Observations, experiment: PerceptionSetup, tags: Mapping[str, str], episode_ix: Int
 ) -> SightChanges:
-    """The changes in the lists of a time chunk. `tags`: those of the log."""
+    """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none."""
     tracks = observations.tracks
-    episode_ix = episodes.number_rows(tracks)
     state = np.zeros(len(episode_ix), dtype=np.int64)
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         rows = rows[episode_ix[rows] >= 0]
@@ -100,14 +119,14 @@ def _keep_changes(lists: SightChanges) -> SightChanges:
     return lists.take(kept)
 
 
-def join_sight_changes(chunks: Sequence[SightChanges], episodes: Episodes) -> SightSpans:
-    """The spans of single units over the whole log."""
+def join_sight_changes(chunks: Sequence[SightChanges], onset_s: Float) -> SightSpans:
+    """The spans of single units over the whole log. `onset_s (M,)`: of the episodes."""
     unit_ix, episode_ix, begin_s, state = _keep_changes(SightChanges(*map(np.concatenate, zip(*chunks, strict=True))))
     begins = np.append(True, (np.diff(unit_ix) != 0) | (np.diff(episode_ix) != 0))[: len(unit_ix)]
     end_s = np.where(
         np.append(begins[1:], True)[: len(unit_ix)], np.inf, np.append(begin_s[1:], np.inf)[: len(unit_ix)]
     )
-    begin_s = np.where(begins & (state != IN_SIGHT), episodes.onset_s[episode_ix], begin_s)
+    begin_s = np.where(begins & (state != IN_SIGHT), onset_s[episode_ix], begin_s)
     return SightSpans(unit_ix, episode_ix, begin_s, end_s, state)
 
 
@@ -123,14 +142,14 @@ class SightTimes(NamedTuple):
 
 
 def measure_sight(
-    spans: SightSpans, experiment: MetricsSetup, names: Sequence[str], equipped: Bool, until_s: Float
+    spans: SightSpans, experiment: PerceptionSetup, names: Sequence[str], equipped: Bool, until_s: Float
 ) -> SightTimes:
     """The times of the units `names`; `equipped (S | 1, U)`: which of the experiment's units each run has.
 
     `until_s (S | 1, M)`: when each object is first listed, or its episode ends.
     """
     episodes = until_s.shape[1]
-    if not names or any(name in experiment.recorded for name in names):
+    if not names or any(name not in experiment.modelled for name in names):
         return SightTimes(*np.full((3, 1, episodes), np.nan))
     modelled, every = list(experiment.modelled), list(experiment.units)
     patterns, which = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
