@@ -21,7 +21,7 @@ from copem_replay.extras.stories.story_pictures import draw_story
 from copem_replay.extras.why.report import read_why, why_late
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.paths import Drive, find_latest_log, read_drive
-from copem_replay.report.html.markup import Html, make_tag
+from copem_replay.report.html.markup import Html, make_tag, story_anchor
 from copem_replay.report.html.study import NO_RECORDING, ReportData
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import choose_shown_objects
@@ -115,4 +115,5 @@ def _story_element(story: ObjectStory, log: str | None) -> Html:
     lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
     causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
     causes = [make_tag("p", helps), *causes] if helps else causes
-    return make_tag("div", title, make_tag("p", said, *beside), *causes, figure, class_="told")
+    told = title, make_tag("p", said, *beside), *causes, figure
+    return make_tag("div", *told, class_="told", id_=story_anchor(story.drive.log, story.object_id))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterable, Sequence
+from urllib.parse import quote
 
 from copem_replay.core.errors import escape_unprintable
 from copem_replay.report.figures.style import Appearance, Colour
@@ -34,6 +35,24 @@ def make_tag(name: str, *children: str, **attributes: str | bool | None) -> Html
 def join_html(parts: Iterable[str], between: str = "") -> Html:
     """Parts in a row, escaped, with `between` between them."""
     return Html(escape_text(between).join(map(escape_text, parts)))
+
+
+def story_anchor(log: str, object_id: str) -> str:
+    """The id of an object's story on a page, for links from sentences that name it."""
+    return "story-" + quote(f"{log}-{object_id}", safe="").replace("%", "_")
+
+
+def link_story(words: str, log: str, object_id: str) -> Html:
+    """Words as a link to the story of an object. A page without this story has the words alone (`drop_dead_links`)."""
+    return make_tag("a", words, href=f"#{story_anchor(log, object_id)}")
+
+
+_STORY_LINK = re.compile(r'<a href="#(story-[^"]*)">(.*?)</a>')
+
+
+def drop_dead_links(body: Html) -> Html:
+    """A body in which links to stories that it does not have are plain words."""
+    return Html(_STORY_LINK.sub(lambda link: link[0] if f' id="{link[1]}"' in body else link[2], body))
 
 
 def allow_breaks(name: str) -> Html:

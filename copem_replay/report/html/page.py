@@ -18,6 +18,7 @@ from copem_replay.report.figures.style import Appearance, render_figure, take_no
 from copem_replay.report.html.conclusions import write_details, write_lead
 from copem_replay.report.html.markup import (
     Html,
+    drop_dead_links,
     escape_text,
     join_html,
     line_swatch,
@@ -63,7 +64,7 @@ def section_links(sections: Iterable[tuple[str, str]]) -> Html:
 
 def whole_page(title: str, body: Html) -> str:
     """A page around a body, with style, script, and the greys of a dark screen."""
-    own = files("copem_replay.report.html")
+    own, body = files("copem_replay.report.html"), drop_dead_links(body)
     style, script = ((own / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     return "\n".join(
         [
