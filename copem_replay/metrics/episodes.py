@@ -32,7 +32,7 @@ from copem_replay.perception.sensor_poses import (
     offset_places,
     unit_ground,
 )
-from copem_replay.perception.visibility import Asked, Statics, visible_shares
+from copem_replay.perception.visibility import Statics, visible_shares
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ def _find_best_share(
         static,
         make_observers(places, np.array([find_carrier(scene, u) for u in units.values()])),
         experiment.visibility,
-        Asked(np.tile(measured, (len(units), 1)), np.full(len(measured), -1)),
+        np.tile(measured, (len(units), 1)),
     )
     best: Float = np.max(np.where(np.isnan(shares), 0.0, shares), axis=0)
     return best

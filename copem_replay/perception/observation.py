@@ -21,7 +21,7 @@ from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.pem.condition import ExistenceScores, find_couples, may_apply
 from copem_replay.perception.pem.detection import ask_detection_probability
 from copem_replay.perception.sensor_poses import SensorPoses, UnitPoses, make_observers, place_units
-from copem_replay.perception.visibility import Asked, visible_shares
+from copem_replay.perception.visibility import visible_shares
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def observe_objects(
     until_s: float = np.inf,
     kept: KeptShares | None = None,
     cut_s: float | None = None,
-    stretches: Callable[[Tracks], Int] | None = None,
+    as_read: bool = False,
     only_ix: Int | None = None,
 ) -> Observations:
     """All observation rows of an experiment's units over one log (`truth`: the world at its own frames).
@@ -135,17 +135,15 @@ def observe_objects(
     the units are, None: it is computed. `kept`: visible shares of this log and its units; `cut_s`: the instant from
     which on other calls ask for these rows again, None: `from_s`.
 
-    `stretches`: gives a number to rows of a world, −1: none. Then shares may be NaN where no couple can apply, except
-    for the ego, and in each stretch up to the first row that shows. None: all are there. `only_ix`: the objects whose
-    rows are wanted, None: of all.
+    `as_read`: shares are NaN where nothing reads them: where no couple can apply, except for the ego. `only_ix`: the
+    objects whose rows are wanted, None: of all.
     """
     if placed is None:
         placed = place_units(scene, truth, experiment)
     pieces: dict[str, tuple[Tracks, ViewGeometry]] = {}
     for names, world in interpolate_worlds(scene, truth, experiment, placed, from_s, until_s):
         asked = partial(
-            _ask_for_shares, names, scene=scene, experiment=experiment, placed=placed, stretches=stretches,
-            only_ix=only_ix,
+            _ask_for_shares, names, scene=scene, experiment=experiment, placed=placed, as_read=as_read, only_ix=only_ix,
         )  # fmt: skip
         seen = partial(_see_world, names, experiment=experiment, placed=placed, asked=asked)
         shares = seen(world) if kept is None else kept.of(names[0], world, (from_s, cut_s or from_s, until_s), seen)
@@ -164,7 +162,7 @@ def observe_objects(
 
 def _see_world(
     names: Sequence[str], world: Tracks, *, experiment: PerceptionSetup, placed: SensorPoses,
-    asked: Callable[[Tracks], Asked | None],
+    asked: Callable[[Tracks], Bool | None],
 ) -> Float:  # fmt: skip
     """Visible shares (U, P) of a world at the lists of the units `names`."""
     carriers = np.array([placed.carrier_ix[name] for name in names])
@@ -174,22 +172,21 @@ def _see_world(
 
 def _ask_for_shares(
     names: Sequence[str], world: Tracks, *, scene: Scene, experiment: PerceptionSetup, placed: SensorPoses,
-    stretches: Callable[[Tracks], Int] | None, only_ix: Int | None,
-) -> Asked | None:  # fmt: skip
-    """Which visible shares of a world are read; None: all. What is nearest is seen at once, by all that may list it."""
-    nowhere = np.full(len(world.frame_ix), -1)
+    as_read: bool, only_ix: Int | None,
+) -> Bool | None:  # fmt: skip
+    """(U, P) which visible shares of a world are read; None: all."""
     if only_ix is not None:
-        return Asked(np.tile(np.isin(world.row_object_ix, only_ix), (len(names), 1)), nowhere)
-    if stretches is None:
+        return np.tile(np.isin(world.row_object_ix, only_ix), (len(names), 1))
+    if not as_read:
         return None
     class_ix, is_ego = scene.object_class[world.row_object_ix], world.row_object_ix == scene.ego_ix
-    always = np.empty((len(names), len(nowhere)), dtype=bool)
+    asked: Bool = np.empty((len(names), len(is_ego)), dtype=bool)
     for k, name in enumerate(names):
         pem = experiment.pems[str(experiment.units[name].pem)].couples
         with np.errstate(invalid="ignore"):  # where the unit is absent
-            view = compute_view(world, placed.poses[name], world.frame_ix, np.zeros(len(nowhere)), class_ix)
-            always[k] = is_ego | may_apply(pem, view, scene.tags)
-    return Asked(always, stretches(world))
+            view = compute_view(world, placed.poses[name], world.frame_ix, np.zeros(len(is_ego)), class_ix)
+            asked[k] = is_ego | may_apply(pem, view, scene.tags)
+    return asked
 
 
 def interpolate_worlds(

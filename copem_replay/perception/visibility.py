@@ -23,8 +23,7 @@ from pydantic_core import PydanticKnownError
 from copem_replay.core.compiled import call_in_room
 from copem_replay.core.components import Component, Slot, ask_component, wrong_answer_error
 from copem_replay.core.errors import is_own
-from copem_replay.core.tracks import Float, Int, Tracks
-from copem_replay.perception.visibility_kernel import Asked as Asked
+from copem_replay.core.tracks import Bool, Float, Int, Tracks
 from copem_replay.perception.visibility_kernel import Boxes, compute_shares
 from copem_replay.perception.visibility_kernel import Observers as Observers
 from copem_replay.perception.visibility_kernel import Statics as Statics
@@ -159,7 +158,7 @@ class _BuiltInModel(VisibilityModel):
 
     flat: ClassVar[bool]
 
-    def shares(self, world: Tracks, static: Statics, observers: Observers, asked: Asked | None = None) -> Float:
+    def shares(self, world: Tracks, static: Statics, observers: Observers, asked: Bool | None = None) -> Float:
         order, _bounds = world.by_frame
         seen, _blocker = _compute_views(world, static, observers, asked, flat=self.flat, blockers=False)
         shares = np.empty_like(seen)
@@ -223,12 +222,12 @@ Visibility = Annotated[
 
 
 def visible_shares(
-    world: Tracks, static: Statics, observers: Observers, model: VisibilityModel, asked: Asked | None = None
+    world: Tracks, static: Statics, observers: Observers, model: VisibilityModel, asked: Bool | None = None
 ) -> Float:
     """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
 
-    `asked`: those to compute, the others may be NaN; None: all. A model of the user's own gives all. Raises InputError
-    where one fails, or gives no shares.
+    `asked (U, P)`: those to compute, the others may be NaN; None: all. A model of the user's own gives all. Raises
+    InputError where one fails, or gives no shares.
     """
     expected = (len(observers.carrier_ix), len(world.frame_ix))
     if not expected[1]:  # a model is not asked about no rows
@@ -266,7 +265,7 @@ def find_blockers(world: Tracks, static: Statics, observers: Observers, model: V
 
 
 def _compute_views(
-    world: Tracks, static: Statics, observers: Observers, asked: Asked | None, *, flat: bool, blockers: bool
+    world: Tracks, static: Statics, observers: Observers, asked: Bool | None, *, flat: bool, blockers: bool
 ) -> tuple[Float, Int]:
     """Shares and blockers (U, P), rows list by list; blockers empty unless wanted."""
     order, bounds = world.by_frame
@@ -280,8 +279,8 @@ def _compute_views(
     place_m, present = np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present)
     places = Observers(place_m, present, observers.carrier_ix)
     if asked is None:
-        asked = Asked(np.ones(out.shape, dtype=bool), np.full(len(order), -1))
-    wanted = Asked(np.ascontiguousarray(asked.always[:, order]), asked.stretch[order])
+        asked = np.ones(out.shape, dtype=bool)
+    wanted = np.ascontiguousarray(asked[:, order])
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.

@@ -60,17 +60,6 @@ class Observers(NamedTuple):
     carrier_ix: Int
 
 
-class Asked(NamedTuple):
-    """Which views are asked for, by unit and row of a world.
-
-    `always (U, P)`: in any case. `stretch (P,)`: besides, of the rows with the same number from 0 on, each unit's up to
-    the first that shows; where later ones are known, too, depends on how the work is cut.
-    """
-
-    always: Bool
-    stretch: Int
-
-
 class FaceColumns(NamedTuple):
     """Columns of a target's face between two azimuths `a` and `b`, (ux, uy) half way between them."""
 
@@ -164,7 +153,7 @@ class _Found(NamedTuple):
 
 
 def compute_shares(
-    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Asked, flat: bool, out: Float,
+    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Bool, flat: bool, out: Float,
     blocker: Int,
 ) -> None:  # fmt: skip
     """Visible shares `out (U, P)` of the lists f0 … f1 − 1, where they are `asked` for.
@@ -189,17 +178,16 @@ def compute_shares(
         np.empty((count, widest, 2)), np.empty(count, BODY), np.full((kept, 3), np.nan), np.zeros(kept, np.bool_),
         np.empty((kept, count), BODY), np.empty((kept, count, widest)),
     )  # fmt: skip
-    shown = np.zeros((units, int(asked.stretch.max(initial=-1)) + 1), np.bool_)  # of each stretch from each unit
     _view_lists(
         f0, f1, boxes, obstacles, places, asked, flat, out, blocker, room, still, index, found,
-        _make_workspace(most, widest), shown,
+        _make_workspace(most, widest),
     )  # fmt: skip
 
 
 @borrowing_kernel
 def _view_lists(
-    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Asked, flat: bool, out: Float,
-    blocker: Int, room: tuple[Float, Any], still: _Still, index: _Index, found: _Found, work: _Work, shown: Bool,
+    f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Bool, flat: bool, out: Float,
+    blocker: Int, room: tuple[Float, Any], still: _Still, index: _Index, found: _Found, work: _Work,
 ) -> None:  # fmt: skip
     # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
     xy, of = room
@@ -210,7 +198,7 @@ def _view_lists(
         _gather_bodies(first, n, boxes, still, xy, of)
         bodies = of[: n + len(obstacles.body)]
         for u in range(places.present.shape[0]):
-            if places.present[u, f] and _find_next(0, u, first, n, asked, shown) < n:
+            if places.present[u, f] and _find_next(0, u, first, n, asked) < n:
                 eye_m = (places.place_m[u, f, 0], places.place_m[u, f, 1], places.place_m[u, f, 2])
                 mine = places.carrier_ix[u]
                 _look_around(
@@ -219,7 +207,7 @@ def _view_lists(
                 _index_bodies(bodies, index)
                 t = -1
                 while True:
-                    t = _find_next(t + 1, u, first, n, asked, shown)
+                    t = _find_next(t + 1, u, first, n, asked)
                     if t >= n:
                         break
                     if boxes.object_ix[first + t] == mine:
@@ -230,17 +218,12 @@ def _view_lists(
                         if alone:
                             blocker[u, first + t] = -1 if b < 0 else first + b if b < n else -2 - bodies[b].owner
                     out[u, first + t] = share
-                    if share > 0.0 and asked.stretch[first + t] >= 0:
-                        shown[u, asked.stretch[first + t]] = True
 
 
 @nb.njit(inline="always")
-def _find_next(t: int, u: int, first: int, n: int, asked: Asked, shown: Bool) -> int:
+def _find_next(t: int, u: int, first: int, n: int, asked: Bool) -> int:
     # The first target from t on that is asked for; n: none.
-    while t < n:
-        stretch = asked.stretch[first + t]
-        if asked.always[u, first + t] or (stretch >= 0 and not shown[u, stretch]):
-            break
+    while t < n and not asked[u, first + t]:
         t += 1
     return t
 

@@ -272,7 +272,7 @@ class Replay:
 
     @cached_property
     def _whole(self) -> Observations:
-        return observe_objects(self.scene, self.truth, self.expanded, self.placed, stretches=self.episodes.number_rows)
+        return observe_objects(self.scene, self.truth, self.expanded, self.placed, as_read=True)
 
     @cached_property
     def no_rows(self) -> Observations:
@@ -294,13 +294,12 @@ class Replay:
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
         """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept.
 
-        Visible shares are there where a couple may apply, of the ego, and of each episode up to the first sight.
+        Visible shares are there where a couple may apply, and of the ego.
         """
         if chunk == TimeChunk():
             return self._whole
         begin_s = chunk.from_s if from_s is None else from_s
-        rows_of_episodes = self.episodes.number_rows
-        return self._observe(chunk, begin_s, kept=self._shares, cut_s=chunk.from_s, stretches=rows_of_episodes)
+        return self._observe(chunk, begin_s, kept=self._shares, cut_s=chunk.from_s, as_read=True)
 
     def _observe(self, chunk: TimeChunk, from_s: float, **how: Any) -> Observations:
         """The observation rows of a time chunk; lists, which are those of the whole log, are in memory once."""

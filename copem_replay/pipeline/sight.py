@@ -28,7 +28,7 @@ from copem_replay.perception.sensor_poses import (
     unit_ground,
 )
 from copem_replay.perception.sight import HIDDEN, NO_UNIT, judge_sight
-from copem_replay.perception.visibility import Asked, VisibilityModel, find_blockers, visible_shares
+from copem_replay.perception.visibility import VisibilityModel, find_blockers, visible_shares
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 
@@ -274,8 +274,7 @@ def _visible_shares(
     near, rows = _keep_near_lines(world, poses, rows, lacks, experiment.visibility)
     asked = np.zeros((1, len(near.frame_ix)), dtype=bool)
     asked[0, rows[lacks]] = True
-    nowhere = np.full(len(near.frame_ix), -1)
-    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, Asked(asked, nowhere))
+    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, asked)
     return np.where(lacks, share[rows], known_shares)
 
 

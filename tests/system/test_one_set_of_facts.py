@@ -30,7 +30,9 @@ from tests.viewer.test_status import lane
 
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared/data"
+SAMPLES = ("tc016d", "crossing_units")
 RECORDINGS = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916", "ind_aah1")
+pytestmark = pytest.mark.extras
 SEEN = ("rate", "outages", "missed", "memory")
 """Causes of an object in sight that is not listed."""
 
@@ -199,7 +201,7 @@ LEAST_S, APART_S = 0.5, 0.15
 """Times that lanes show and stories tell, and how much two may be apart: a list and a bit."""
 
 
-@pytest.mark.parametrize("name", ["tc016d", "crossing_units", *RECORDINGS])
+@pytest.mark.parametrize("name", [*SAMPLES, *(pytest.param(name, marks=pytest.mark.long) for name in RECORDINGS)])
 def test_no_two_outputs_name_different_causes(name: str, tmp_path: Path) -> None:
     if name in RECORDINGS and not (SHARED / f"{name}.mcap").exists():
         pytest.skip("no shared/data beside the project")
