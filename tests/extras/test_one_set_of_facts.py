@@ -32,7 +32,6 @@ ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared/data"
 SAMPLES = ("tc016d", "crossing_units")
 RECORDINGS = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916", "ind_aah1")
-pytestmark = pytest.mark.extras
 SEEN = ("rate", "outages", "missed", "memory")
 """Causes of an object in sight that is not listed."""
 
