@@ -29,7 +29,8 @@ TIMES = ("onset_s", "in_sight_s", "listed_s", "captured_s", "sent_s", "arrived_s
 def of_oncoming(
     unit: dict[str, Any], configuration: dict[str, Any], **changes: Any
 ) -> tuple[list[float], dict[str, float]]:
-    """The oncoming car's times, and what stages the report makes of them. It is in sight at 2 s, listed from 4 s on."""
+    """The oncoming car's times, and what stages the report makes of them. 80 m away at 2 s, it is within range, and
+    listed, from 4 s on."""
     data: dict[str, Any] = {
         "units": {"ego": EGO_UNIT | unit}, "links": {"v2x": {"latency": 0.05}},
         "configurations": {"it": {"units": ["ego"], **configuration}},
@@ -43,25 +44,25 @@ def of_oncoming(
     ("unit", "configuration", "times", "expected"),
     [
         ({"ready": 0.03}, {"link": "v2x", "latency_s": 0.02}, [4.0, 4.0, 4.03, 4.1, 4.1],
-         {"in sight": 2.0, "processing": 0.03, "transport": 0.07, "fusion": 0.0}),
+         {"in sight": 0.0, "processing": 0.03, "transport": 0.07, "fusion": 0.0}),
         # The list of 4.0 s is there at 4.1 s; at the tick, 4.25 s, the newest that is there is that of 4.1 s.
         ({"ready": 0.03}, {"link": "v2x", "latency_s": 0.02, "issue_hz": 4}, [4.0, 4.1, 4.13, 4.2, 4.25],
-         {"in sight": 2.0, "listed": 0.1, "processing": 0.03, "transport": 0.07, "fusion": 0.05}),
+         {"in sight": 0.0, "listed": 0.1, "processing": 0.03, "transport": 0.07, "fusion": 0.05}),
         # Messages go at 3.9 and 4.2 s: what is listed at 4.0 and 4.1 s is not sent.
         ({"sends": {"interval_s": 0.3}}, {}, [4.0, 4.2, 4.2, 4.2, 4.2],
-         {"in sight": 2.0, "listed": 0.2, "transport": 0.0, "fusion": 0.0}),
+         {"in sight": 0.0, "listed": 0.2, "transport": 0.0, "fusion": 0.0}),
         ({"ready": 0.03, "sends": {"interval_s": 0.3}}, {"link": "v2x"}, [4.0, 4.2, 4.23, 4.28, 4.28],
-         {"in sight": 2.0, "listed": 0.2, "processing": 0.03, "transport": 0.05, "fusion": 0.0}),
+         {"in sight": 0.0, "listed": 0.2, "processing": 0.03, "transport": 0.05, "fusion": 0.0}),
         ({"ready": 0.03}, {"link": "v2x", "fusion": {"kind": "gnn"}}, [4.0, 4.0, 4.03, 4.08, 4.08],
-         {"in sight": 2.0, "processing": 0.03, "transport": 0.05, "fusion": 0.0}),
+         {"in sight": 0.0, "processing": 0.03, "transport": 0.05, "fusion": 0.0}),
     ],
 )  # fmt: skip
 def test_by_hand(
     unit: dict[str, Any], configuration: dict[str, Any], times: list[float], expected: dict[str, float]
 ) -> None:
     found, means = of_oncoming(unit, configuration)
-    assert found == [2.0, 2.0, *times]
-    assert means == {"hidden": 0.0} | expected
+    assert found == [2.0, 4.0, *times]
+    assert means == {"out of range or view": 2.0, "hidden": 0.0} | expected
     assert sum(means.values()) == pytest.approx(times[-1] - 2.0, abs=1e-9)
 
 
@@ -69,8 +70,9 @@ def test_of_lists_that_confirm_it_is_the_last() -> None:
     """The second of two lists, which the first is listed before."""
     confirm = {"onset": {"kind": "in_range", "range_m": 80}, "confirm": {"hits": 2, "of": 2}}
     found, means = of_oncoming({}, {"link": "v2x"}, measure=confirm)
-    assert found == [2.0, 2.0, 4.0, 4.1, 4.1, 4.15, 4.15]
-    assert means == {"hidden": 0.0, "in sight": 2.0, "listed": 0.1, "transport": 0.05, "fusion": 0.0}
+    assert found == [2.0, 4.0, 4.0, 4.1, 4.1, 4.15, 4.15]
+    of_sight = {"out of range or view": 2.0, "hidden": 0.0, "in sight": 0.0}
+    assert means == of_sight | {"listed": 0.1, "transport": 0.05, "fusion": 0.0}
 
 
 def test_without_link_ready_or_sends_there_are_no_such_columns() -> None:
