@@ -21,6 +21,7 @@ from copem_replay.extras.stories.story_facts import find_lost
 from copem_replay.extras.stories.story_pictures import place_words
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.paths import average_unknown, late_paths_figure, read_drive
+from copem_replay.report.html.markup import drop_dead_links, join_html, link_story
 from copem_replay.report.html.page import build_page
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import Results, read_results
@@ -58,6 +59,15 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
     assert "half: known after 0.30 s, by the list of mast, which arrives 0.30 s late." in said
     assert "copem-replay view FOLDER --object 3" not in said, "no run is shown"
     assert 'viewBox="0 0 960 360"' in story
+
+
+def test_links_lead_to_the_stories_that_a_page_has(hidden: Path) -> None:
+    """The pedestrian has one; the lorry's name stays a name."""
+    [_, story] = story_parts(load_study(hidden))
+    links = [link_story(words, "drive", name) for words, name in (("pedestrian 3", "3"), ("<car> 9", "9"))]
+    body = drop_dead_links(join_html([*links, story]))
+    assert body.startswith('<a href="#story-drive-3">pedestrian 3</a>&lt;car&gt; 9<div ')
+    assert body.count(' id="story-drive-3"') == 1
 
 
 def test_stories_are_those_of_the_viewer(hidden: Path) -> None:
