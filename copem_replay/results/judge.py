@@ -418,15 +418,9 @@ class _JudgedStudy:
         return self._limit_sums(criterion, configuration, sums, columns, of, over, least)
 
     def _limit_sums(
-        self,
-        criterion: Criterion,
-        configuration: str,
-        rows: pd.DataFrame,
-        columns: Sequence[str],
-        of: Any,
-        over: str,
-        least: float = 0.0,
-    ) -> JudgedFigure:
+        self, criterion: Criterion, configuration: str, rows: pd.DataFrame, columns: Sequence[str], of: Any,
+        over: str, least: float = 0.0,
+    ) -> JudgedFigure:  # fmt: skip
         clusters, why = None, ""
         fixed = criterion.of_runs and configuration in self.traffic.settings.fixed
         if not fixed:

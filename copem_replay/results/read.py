@@ -230,13 +230,9 @@ class Results:
         return place.shown
 
     def fill(
-        self,
-        place: ResultsPlace,
-        *,
-        skipped: Sequence[tuple[File, str]] = (),
-        viewer: str | None = None,
+        self, place: ResultsPlace, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None,
         label: str | None = None,
-    ) -> list[str]:
+    ) -> list[str]:  # fmt: skip
         """Write the results into a place that is locked. Returns notes, one line each.
 
         `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the

@@ -1,8 +1,9 @@
-"""Objects shown, in viewers and in stories of reports: those that words, lanes and near views are about, and when.
+"""Objects shown, in viewers, stories, films and figures of single runs: those that tell configurations apart, and when.
 
-An object is worth a look if configurations know it at different times while it is near the ego's path. One that is in
-the log for less than `OBSERVED_S` before or after its onset tells nothing of them: how soon it could have been known is
-decided by where the log is cut. It is listed as too short to judge.
+An object is worth a look if configurations know it at different times while it is near the ego's path. What a
+configuration is late everywhere tells nothing of one object: it is taken off first. An object that is in the log for
+less than `OBSERVED_S` before or after its onset tells nothing either: how soon it could have been known is decided by
+where the log is cut. It is listed as too short to judge.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import pandas as pd
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Float, Int, Scene, Tracks
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.sensor_poses import find_carrier
 
 SHOWN_OBJECTS = 6
@@ -33,9 +35,9 @@ _STEP_S = 0.25
 
 @dataclass(frozen=True)
 class ShownObjects:
-    """Indices of the objects shown, the most telling one first, and ids of the measured objects too short to judge.
+    """Indices of the objects shown, the most telling one first, and ids of those that count, too short to judge.
 
-    Where all measured objects are too short to judge, some of them are shown all the same.
+    Where all that count are too short to judge, some of them are shown all the same.
     """
 
     object_ix: tuple[int, ...] = ()
@@ -45,31 +47,44 @@ class ShownObjects:
 def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, table: pd.DataFrame) -> ShownObjects:
     """The objects with the largest product of difference in time and nearness to the ego's path, six at most.
 
-    The difference is between the first and the last configuration that knows an object; one that never does counts as
-    knowing it at the end of the episode. Equal products are in the order of nearness. `table`: rows of one run of one
-    log, a row per object and configuration.
+    The difference is that of `measure_apart`; objects with equal products are in the order of nearness. Objects that
+    do not count (`measure.began`) are left out, unless none does. `table`: rows of one run of one log, a row per object
+    and configuration.
     """
     if not len(table):
         return ShownObjects()
-    rows = select_differing_rows(experiment, table)
-    by_object = rows.groupby("object_id", sort=False)
-    after_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"]).groupby(rows["object_id"])
-    episodes = by_object[["onset_s", "ended_s"]].first()
-    episodes["apart_s"] = after_s.max() - after_s.min()
-    known_s = by_object["detection_s"].max()
-    episodes["last_s"] = known_s.fillna(np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S))
+    counted = select_counted(table, experiment.measure.began)
+    episodes = measure_apart(experiment, counted if len(counted) else table)
     episodes["near"] = 1 / (1 + (_distance_to_path(scene, truth, experiment, episodes) / NEAR_M) ** 2)
-    episodes["rank"] = (episodes["apart_s"] * episodes["near"]).round(6)  # rounding of times decides nothing
-    observed = is_observed_long(episodes)
-    judged = episodes[observed] if observed.any() else episodes
-    chosen = judged.sort_values(["rank", "near"], ascending=False, kind="stable").index[:SHOWN_OBJECTS]
-    return ShownObjects(tuple(scene.object_number[name] for name in chosen), tuple(episodes.index[~observed].tolist()))
+    for name in ("apart_s", "apart_raw_s"):
+        episodes[name] = (episodes[name] * episodes["near"]).round(6)  # rounding of times decides nothing
+    judged = episodes[episodes["observed"]] if episodes["observed"].any() else episodes
+    ranked = judged.sort_values(["apart_s", "apart_raw_s", "near"], ascending=False, kind="stable").index
+    chosen = tuple(scene.object_number[name] for name in ranked[:SHOWN_OBJECTS])
+    return ShownObjects(chosen, tuple(episodes.index[~episodes["observed"]].tolist()))
 
 
-def is_observed_long(episodes: pd.DataFrame) -> pd.Series:
-    """Of each row whether its object is in the log for `OBSERVED_S` before and after its onset."""
+def measure_apart(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
+    """By id of the objects of one run of one log: `apart_s`, how much later one configuration knows it than another,
+    at most, without what it usually is later than that: by medians over the objects that are `observed` long enough.
+
+    `apart_raw_s`: with it. One that never knows an object counts as knowing it at the end of the episode. Beside them
+    `onset_s`, `ended_s`, and `last_s`, when the last one knows it.
+    """
+    rows = select_differing_rows(experiment, table)
+    rows = rows.assign(after_s=rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"]))
+    by_object = rows.groupby("object_id", sort=False)
+    episodes = by_object[["onset_s", "ended_s"]].first()
     least_s = np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"])
-    return least_s >= OBSERVED_S - SAME_INSTANT_S
+    episodes["observed"] = observed = least_s >= OBSERVED_S - SAME_INSTANT_S
+    after_s = rows.groupby(["object_id", "configuration"])["after_s"].first().unstack().loc[episodes.index]
+    usual_s = after_s[observed if observed.any() else least_s >= 0].quantile(0.5, interpolation="lower")
+    later_s = [after_s.sub(after_s[name], axis=0) - (usual_s - usual_s[name]).clip(lower=0.0) for name in after_s]
+    episodes["apart_s"] = np.max([of.max(axis=1) for of in later_s], axis=0)
+    episodes["apart_raw_s"] = after_s.max(axis=1) - after_s.min(axis=1)
+    end_s = np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S)
+    episodes["last_s"] = by_object["detection_s"].max().fillna(end_s)
+    return episodes
 
 
 def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:

@@ -140,13 +140,9 @@ MCAP = Exporter(".mcap", _write_mcap)
 
 
 def fill_place(
-    place: ResultsPlace,
-    study: StudyTables,
-    *,
-    exporters: Sequence[Exporter],
-    skipped: Sequence[tuple[File, str]] = (),
-    label: str | None = None,
-) -> list[str]:
+    place: ResultsPlace, study: StudyTables, *, exporters: Sequence[Exporter],
+    skipped: Sequence[tuple[File, str]] = (), label: str | None = None,
+) -> list[str]:  # fmt: skip
     """Write results into a place that is locked. Returns notes for the user. Raises OutputError.
 
     `exporters`: each writes every shown run (`show` in the experiment) as a file. `skipped`: recordings that are left
@@ -196,11 +192,9 @@ def check_own_files(
 
 
 def list_results(
-    experiment: Experiment,
-    recordings: Sequence[Recording],
-    exporters: Sequence[Exporter],
+    experiment: Experiment, recordings: Sequence[Recording], exporters: Sequence[Exporter],
     tables: Iterable[str] = ("detections.parquet", "tally.parquet"),
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """The files that the results of an experiment have, by names relative to the folder.
 
     `tables`: the files of those tables that are a folder where they have many rows.

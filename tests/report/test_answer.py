@@ -25,7 +25,7 @@ from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.detection_curves import curves_figure
 from copem_replay.report.figures.differences import differences_figure
 from copem_replay.report.figures.false_positives import false_positives_figure
-from copem_replay.report.figures.selection import choose_object_and_run, find_differing, find_most_telling
+from copem_replay.report.figures.selection import choose_object_and_run, find_differing
 from copem_replay.report.figures.style import (
     DARK,
     WHITE,
@@ -221,49 +221,26 @@ class TestEighteen:
 
 
 class TestWhichObject:
-    @given(st.data())
-    def test_the_one_known_at_the_most_different_times(self, data: st.DataObject) -> None:
-        """Of one log: the first object with the largest difference between A and B, then the one known last."""
-        objects, names = data.draw(st.integers(1, 5)), ("GT", "A", "B")
-        table = pd.DataFrame(
-            [("x", str(o), name) for name in names for o in range(objects)],
-            columns=["log", "object_id", "configuration"],
-        )
-        times = st.one_of(st.none(), st.integers(0, 3).map(float))
-        table["time_to_detection_s"] = [data.draw(times) for _ in range(len(table))]
-        table["time_to_detection_s"] = table["time_to_detection_s"].astype(float)
-        table["onset_s"], table["ended_s"] = 0.0, 4.0
-        table["conflict"] = [data.draw(st.booleans())] * len(table)
-        after = {
-            o: table.loc[(table["object_id"] == o) & (table["configuration"] != "GT"), "time_to_detection_s"].fillna(
-                4.0
-            )
-            for o in dict.fromkeys(table["object_id"])
-        }
-        first = max(after, key=lambda o: (after[o].max() - after[o].min(), after[o].max()))
-        assert find_most_telling(table, ("GT",)) == ("x", first)
+    def test_by_default_the_one_that_the_viewer_shows_first(self, two: Results) -> None:
+        """Of the run that is drawn; with others asked for, too."""
+        for selection in (Selection(), Selection(run=2), Selection(("half", "late"))):
+            choice = choose_object_and_run(two, selection)
+            (table,) = two.each(log=choice.log, every=True)
+            recording = two.recording(choice.log, two.experiment)
+            of_run = first_episodes(table[table["run"] == choice.run])
+            shown = choose_shown_objects(recording.scene, recording.truth, two.experiment, of_run).object_ix
+            assert choice.object_id == recording.scene.object_ids[shown[0]]
 
-    def test_one_at_the_edge_of_the_log_comes_after_those_that_can_be_judged_unless_it_is_in_conflict(self) -> None:
-        """`early` and `late` tell configurations apart by 1.5 s, `whole` by 1 s; the clocks of `early` start at 1.9 s,
-        and `late` is gone 1.9 s after its onset."""
-        episodes = [("early", 1.5, 1.9, 9.0), ("late", 1.5, 7.0, 8.9), ("whole", 1.0, 2.0, 4.0)]
-        columns = ["object_id", "time_to_detection_s", "onset_s", "ended_s"]
-        later = pd.DataFrame(episodes, columns=columns).assign(log="x", configuration="B")
-        table = pd.concat([later.assign(time_to_detection_s=0.0, configuration="A"), later], ignore_index=True)
-        assert find_most_telling(table, ()) == ("x", "whole")
-        in_conflict = table.assign(conflict=table["object_id"] == "late")
-        assert find_most_telling(in_conflict, ()) == ("x", "late")
-
-    def test_by_default_the_one_of_the_run_that_is_drawn(self, two: Results, tmp_path: Path) -> None:
-        """The pedestrian in the way is in conflict; without that, the one that `half` knows later."""
-        assert choose_object_and_run(two, Selection()).object_id == "2"
-        table = two.detections.assign(conflict=False)
+    def test_without_the_recording_by_the_table_alone(self, two: Results, tmp_path: Path) -> None:
+        """The object that `half` knows later than the others by more than it usually does."""
+        table = two.detections
         run = int(table.loc[table["configuration"] == "half"].sort_values("time_to_detection_s")["run"].iloc[-1])
-        of_run = table[(table["run"] == run) & (table["configuration"] != "GT")]
-        late_s = of_run["time_to_detection_s"].fillna(of_run["ended_s"] - of_run["onset_s"])
-        spread = late_s.groupby(of_run["object_id"]).agg(lambda s: s.max() - s.min())
-        chosen = choose_object_and_run(with_rows(two, table, tmp_path / "without"), Selection(run=run))
-        assert spread[chosen.object_id] == spread.max()
+        moved = with_rows(two, table, tmp_path / "without")
+        for recording in moved.folder.parent.glob("*.mcap"):
+            recording.unlink()
+        apart = measure_apart(two.experiment, first_episodes(table[table["run"] == run]))
+        chosen = choose_object_and_run(moved, Selection(run=run))
+        assert apart["apart_s"][chosen.object_id] == apart["apart_s"][apart["observed"]].max()
         assert len(chosen.configurations) == 4
         assert (chosen.configurations[0], chosen.configurations[-1]) == ("GT", "never")
 

@@ -39,13 +39,16 @@ def ready(**things: tuple[float, float]) -> tuple[Replay, Experiment]:
     return prepare_log(scene, asked), asked
 
 
-def table(*rows: tuple[str, float, float, float | None, float | None]) -> pd.DataFrame:
+def table(
+    *rows: tuple[str, float, float, float | None, float | None], uncounted: tuple[str, ...] = ()
+) -> pd.DataFrame:
     """Of each object id, onset and end, and when x and y know it; the truth knows it at once."""
     found: list[dict[str, Any]] = []
     for name, onset_s, ended_s, *known in rows:
         for configuration, known_s in zip(NAMES, (onset_s, *known), strict=True):
             found.append({
                 "configuration": configuration, "object_id": name, "onset_s": onset_s, "ended_s": ended_s,
+                "began": "log_start" if name in uncounted else "appeared",
                 "detection_s": known_s, "detected": known_s is not None,
                 "time_to_detection_s": None if known_s is None else known_s - onset_s,
             })  # fmt: skip
@@ -55,19 +58,35 @@ def table(*rows: tuple[str, float, float, float | None, float | None]) -> pd.Dat
 
 def shown(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
     replay, asked = ready(**PLACES)
-    chosen = choose_shown_objects(replay.scene, replay.truth, asked, rows)
+    counts = asked.model_copy(update={"measure": asked.measure.model_copy(update={"began": ("appeared", "crossed")})})
+    chosen = choose_shown_objects(replay.scene, replay.truth, counts, rows)
     return [replay.scene.object_ids[k] for k in chosen.object_ix], list(chosen.too_short)
 
 
 def test_difference_times_nearness() -> None:
-    """2 m, 20 m and 60 m from the path: 1.04, 5 and 37 times less than on it; differences of 1, 4 and 8 s."""
-    rows = table(
-        ("near", 2.0, 10.0, 2.0, 3.0), ("beside", 2.0, 10.0, 2.0, 6.0), ("far", 2.0, 10.0, 2.0, None),
-        ("alike", 2.0, 10.0, 4.0, 4.0),
-    )  # fmt: skip
-    assert shown(rows) == (["near", "beside", "far", "alike"], [])
-    rows = rows.replace({"detection_s": {3.0: 2.5}, "time_to_detection_s": {1.0: 0.5}})
-    assert shown(rows)[0] == ["beside", "near", "far", "alike"], "4 s / 5 is more than 0.5 s / 1.04"
+    """2 m, 20 m and 60 m from the path: 1.04, 5 and 37 times less than on it; y is 2, 4 and 8 s later than x."""
+    on_time = (("early", 2.0, 10.0, 2.0, 2.0), ("alike", 2.0, 10.0, 2.2, 2.2), ("short", 2.0, 10.0, 2.5, 2.5))
+    rows = table(("near", 2.0, 10.0, 2.0, 4.0), ("beside", 2.0, 10.0, 2.0, 6.0), ("far", 2.0, 10.0, 2.0, None), *on_time)
+    assert shown(rows)[0] == ["near", "beside", "far", "early", "short", "alike"]
+    rows = rows.replace({"detection_s": {4.0: 2.8}, "time_to_detection_s": {2.0: 0.8}})
+    assert shown(rows)[0][:3] == ["beside", "near", "far"], "(4 − 0.5) s / 5 is more than (0.8 − 0.5) s / 1.04"
+
+
+def test_what_a_configuration_is_late_everywhere_decides_nothing() -> None:
+    """y is 0.5 s late by its latency. Of `near` it is nothing more, of `beside` 0.7 s, of `far` x and y know alike."""
+    usual = [(name, 2.0, 10.0, 2.0, 2.5) for name in ("near", "early", "short")]
+    rows = table(*usual, ("beside", 2.0, 10.0, 2.0, 2.7), ("far", 2.0, 10.0, 4.0, 4.0))
+    assert shown(rows)[0] == ["beside", "near", "early", "short", "far"], "the rest by the difference with the latency"
+    swapped = rows.assign(configuration=rows["configuration"].map({"GT": "GT", "x": "y", "y": "x"}))
+    assert shown(swapped) == shown(rows), "whoever it is"
+    assert shown(table(("near", 2.0, 10.0, 2.0, 2.1), ("beside", 2.0, 10.0, 2.0, 2.0)))[0][0] == "near", "of two"
+
+
+def test_objects_that_do_not_count_are_left_out_unless_none_does() -> None:
+    rows = (("near", 2.0, 10.0, 2.0, 9.0), ("early", 1.0, 10.0, 2.0, 9.0), ("beside", 2.0, 10.0, 2.0, 2.0))
+    assert shown(table(*rows, uncounted=("near", "early"))) == (["beside"], []), "nor too short to judge"
+    every = table(*rows, uncounted=("near", "early", "beside"))
+    assert shown(every) == (["near", "beside"], ["early"])
 
 
 def test_the_path_is_that_of_the_next_three_seconds() -> None:

@@ -146,7 +146,6 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
     (rows,) = results.each(log=choice.log, every=True)
     of_run, table = first_episodes(rows[rows["run"] == choice.run]), first_episodes(its_rows)
     scene, truth = replayed.replay.scene, replayed.replay.truth
-    # No conflict decides here, unlike in `plot runs`: the page has the stories of these objects above.
     shown = [scene.object_ids[k] for k in choose_shown_objects(scene, truth, asked, of_run).object_ix]
     measured = _list_measured(scene, table, shown)
     onset_s = measured[0][1]

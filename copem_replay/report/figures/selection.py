@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import InputError
+from copem_replay.core.errors import CopemError, InputError
+from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.metrics.onset import COUNTS_BY
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
-from copem_replay.results.shown_objects import is_observed_long
+from copem_replay.report.figures.style import shorten_names, sort_soonest_first
+from copem_replay.results.shown_objects import choose_shown_objects, measure_apart
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
@@ -25,7 +27,7 @@ _COLUMNS = 4
 """Configurations side by side unless some are named, as many as in the figures of Piazzoni et al. 2022."""
 MOST_LINES = 12
 """Most configurations in one plot: more cannot be distinguished."""
-_RANKED_BY = ("time_to_detection_s", "onset_s", "ended_s", "conflict", "braking_pass")
+_RANKED_BY = ("time_to_detection_s", "detection_s", *COUNTS_BY, "conflict", "braking_pass")
 _NAMED = 12
 """Most ids named in an error: more would hide its end."""
 
@@ -61,9 +63,9 @@ class Choice:
 def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     """The selected object, run and configurations.
 
-    By default these are the most telling object that counts (`find_most_telling`), the run shown in the .rrd, else the
-    first, and four configurations from best to worst. Any object may be named. Raises InputError for a selection that
-    is not among the results.
+    By default these are the object that counts and tells most (`choose_shown_objects`), the run shown in the .rrd, else
+    the first, and four configurations from best to worst. Any object may be named. Raises InputError for a selection
+    that is not among the results.
     """
     known = results.tally[results.tally["event"] == DETECTED]
     for key, column, value in (("log", "log", selection.log), ("object", "object_id", selection.object_id)):
@@ -77,7 +79,7 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     known = counted if len(counted) else known
     asked_names = results.chosen(selection.configurations)
     of_run = _rows_of_run(results, known, selection.run)
-    log, object_id = find_most_telling(of_run, find_truths(results))
+    log, object_id = _find_most_telling(results, of_run)
     run = int(of_run.loc[of_run["log"] == log, "run"].iloc[0])
     (rows,) = results.each("object_id", "configuration", *_RANKED_BY, log=log, every=True)
     present_names = tuple(name for name in asked_names if (rows["configuration"] == name).any())
@@ -108,31 +110,27 @@ def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.D
     return of_run
 
 
-def find_most_telling(table: pd.DataFrame, upper: Sequence[str]) -> tuple[str, str]:
-    """Log and id of the object that tells configurations apart most; of equal ones the first.
+def _find_most_telling(results: Results, of_run: pd.DataFrame) -> tuple[str, str]:
+    """The object that tells configurations apart most, as the viewer shows it, and its log, the first of equal ones.
 
-    Objects in conflict with the ego rank first, then those that are not too short to judge, as in the viewer, then by
-    the spread of their times to detection over configurations, then by the latest of them. An object that was never
-    known counts as known at the end of its episode. `upper`, the ground truth, is left out unless there are no others.
+    Where the recording cannot be read, how near the ego's path an object is does not decide.
     """
-    # A conflict decides, unlike in the viewer: the figure of runs is about how the ego brakes. How near its path an
-    # object is takes the recording, which a table of results may lack.
-    others = table[~table["configuration"].isin(list(upper))]
-    rows = others if len(others) else table
-    time_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
-    keys = [rows["log"], rows["object_id"]]
-    by_object = time_s.groupby(keys, sort=False)
-    conflict = rows["conflict"] if "conflict" in rows else pd.Series(False, index=rows.index)
-    rank = pd.DataFrame(
-        {
-            "conflict": conflict.fillna(False).astype(bool).groupby(keys, sort=False).any(),
-            "observed": is_observed_long(rows).groupby(keys, sort=False).any(),
-            "apart": by_object.max() - by_object.min(),
-            "late": by_object.max(),
-        }
-    )
-    log, object_id = rank.sort_values(list(rank), ascending=False, kind="stable").index[0]
-    return str(log), str(object_id)
+    apart = {
+        log: measure_apart(resolve_for_log(results.experiment, log), rows).sort_values(
+            ["observed", "apart_s", "apart_raw_s"], ascending=False, kind="stable"
+        )
+        for log, rows in of_run.groupby("log", sort=False)
+    }
+    log = max(apart, key=lambda name: tuple(apart[name][["observed", "apart_s"]].iloc[0]))
+    first, asked = str(apart[log].index[0]), resolve_for_log(results.experiment, log)
+    if len(apart[log]) == 1:
+        return log, first
+    try:
+        recording = results.recording(log, asked)
+    except CopemError:
+        return log, first
+    shown = choose_shown_objects(recording.scene, recording.truth, asked, of_run[of_run["log"] == log])
+    return log, recording.scene.object_ids[shown.object_ix[0]]
 
 
 def find_differing(results: Results, names: Sequence[str], most: int = MOST_LINES) -> tuple[str, ...]:

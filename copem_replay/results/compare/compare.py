@@ -551,18 +551,32 @@ def _overall_rows(
 
 
 def _limit_difference(
-    regret: Regret,
-    difference: float,
-    sides: tuple[LabelledConfiguration, LabelledConfiguration],
-    names: ClusterNames,
-    asked: PairsAsked,
-    confidence: float,
-) -> dict[str, object]:
-    """The columns of a difference's limits at a confidence."""
+    regret: Regret, difference: float, sides: tuple[LabelledConfiguration, LabelledConfiguration], names: ClusterNames,
+    asked: PairsAsked, confidence: float,
+) -> dict[str, object]:  # fmt: skip
+    """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
     over = "runs" if asked.over_runs else regret.over
     what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
     fixed = all(getattr(side.facts, what) for side in sides)
-    return difference_limits(regret.figure, difference, over, names, fixed=fixed, confidence=confidence)
+    limits = difference_limits(regret.figure, difference, over, names, fixed=fixed, confidence=confidence)
+    sign = COMPARED[regret.metric].better * (_is_never_worse(*sides) - _is_never_worse(*sides[::-1]))
+    if sign * difference < 0 or regret.metric not in _IN_TIME or not sign:
+        return limits
+    least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
+    found: dict[str, Any] = {name: limits[name] for name in _LIMITS if limits.get(name) is not None}
+    return limits | {name: min(max(limit, least), most) for name, limit in found.items()}
+
+
+_LIMITS = ("low", "high", "low_bounded", "high_bounded")
+_IN_TIME = ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s")
+"""Metrics in which nothing is better than the truth, nor than ideal fusion of the same lists, row by row."""
+
+
+def _is_never_worse(one: LabelledConfiguration, other: LabelledConfiguration) -> bool:
+    """Whether one knows every object at the instant at which the other does, or before, whatever is drawn."""
+    facts = other.facts
+    of_inputs = one.results is other.results and (facts.ideal, facts.ideal_of) == (one.configuration, "inputs")
+    return one.facts.truth or (of_inputs and not facts.recorded)
 
 
 def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:

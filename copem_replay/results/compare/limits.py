@@ -419,14 +419,9 @@ def find_decisive_log(figure: PairStatistic, difference: float, names: ClusterNa
 
 
 def difference_limits(
-    figure: PairStatistic,
-    difference: float,
-    over: str | None,
-    names: ClusterNames,
-    *,
-    fixed: bool,
+    figure: PairStatistic, difference: float, over: str | None, names: ClusterNames, *, fixed: bool,
     confidence: float = CONFIDENCE,
-) -> dict[str, object]:
+) -> dict[str, object]:  # fmt: skip
     """The columns `low`, `high`, `low_bounded`, `high_bounded`, `interval`, `interval_over` and `clusters` of a
     difference, as far as they exist.
 

@@ -323,12 +323,8 @@ class _Pair:
 
 
 def compute_regrets(
-    first: PairSide,
-    second: PairSide,
-    grid: PairingGrid,
-    setting: PairSettings,
-    only: Sequence[str] | None = None,
-) -> Iterator[Regret]:
+    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, only: Sequence[str] | None = None,
+) -> Iterator[Regret]:  # fmt: skip
     """The metrics of a log, all or `only` some, for which both sides have the data.
 
     Those of lists are over all rows that both sides have, the others over those that count.
