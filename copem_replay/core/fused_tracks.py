@@ -33,8 +33,7 @@ class FusedTracks:
     """The fused lists as tracks, and the entries of the units' lists that each fused row (P,) is made of.
 
     Fusions without truth ids give the rows alone: `said` (P,) then holds the entries of the fusion, in one run, and
-    `object_ix` of a track the true object it is matched with, −1: none. `stated_s` (P,): their captures as units state
-    them, where those are not the true ones.
+    `object_ix` of a track the true object it is matched with, −1: none. `stated_s` (P,): captures as units state them.
 
     >>> fused = cr.fused_tracks("logs/tc016d.yaml", "logs/tc016d.mcap")["PEM"]
     >>> fused.fused.valid.sum() == len(fused.to_dataframe())
@@ -50,15 +49,16 @@ class FusedTracks:
     scene: Scene | None = None  # of the log, where rows are to be named
     faults: UnitFaults | None = None  # of `received`, in one run: where a unit has outages or ghosts
     stated_s: Float | None = None  # None: the captures that are stated are the true ones
+    second_of: Int | None = None  # (P,) the object that each row is a second entry of, −1: none; None: no row is
     by_link: Bool | None = None  # (F,) lists of `received` that units send by a link, in one run; None: there is none
 
     def to_dataframe(self) -> pd.DataFrame:
         """The entries of all lists of one run, in the order of the lists.
 
         `available_s`: when the receiver has the list. `captured_s`: the newest capture that contributed. `object_id`:
-        the true object, null where a false positive is matched with none; `track_id`: of the fusion, −1: none.
-        `object_class`: as `class_of`. State and position covariance as in `Tracks`; `existence`: null where not said.
-        Raises ValueError for tracks of several runs, or without a scene to name objects by.
+        the true object, null without a match; `track_id`: of the fusion, −1: none. `object_class`: as `class_of`. State
+        and covariance as in `Tracks`; `existence`: null where not said. Raises ValueError for several runs, or without
+        a scene to name objects by.
         """
         import pandas as pd
 

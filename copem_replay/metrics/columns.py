@@ -261,12 +261,12 @@ _LISTS = (
     Column("lists", "whole numbers", "fused lists at which there is a place to measure distances from"),
     Column("minutes", "numbers", "minutes of log from the first of them to the last, while the ego is in the log",
            compared=True),
-    Column("ghosts", "whole numbers", "entries of measured classes at no object", compared=True),
-    Column("stale_ghosts", "whole numbers",
-           "of these, entries that were about some object at the instant they tell of"),
+    Column("ghosts", "whole numbers", "entries of measured classes about nobody, at the instant they tell of",
+           compared=True),
+    Column("stale_ghosts", "whole numbers", "beside these, entries about somebody who is elsewhere now"),
     Column("duplicates", "whole numbers", "entries about a measured object beside its match"),
     Column("existence", "lists of numbers", "thresholds of existence", compared=True),
-    Column("ghosts_at", "lists of whole numbers", "ghosts that are not stale, of at least that existence",
+    Column("ghosts_at", "lists of whole numbers", "ghosts of at least that existence",
            compared=True),
     Column("without_truth", "whole numbers",
            "held entries, over all frames, whose measured object has no truth at the frame", compared=True),
@@ -294,6 +294,20 @@ _NEEDLESS = (
     Column("x_m", "numbers", "listed place of the entry, east"),
     Column("y_m", "numbers", "listed place of the entry, north"),
 )  # fmt: skip
+_FALSE_TRACKS = (
+    *_LOG, _RUN,
+    Column("begins_s", "numbers", "when its first list is available", full=True),
+    Column("lasts_s", "numbers", "until when lists hold it, since then"),
+    Column("entries", "whole numbers", "its entries: all together are the `ghosts` of `lists.parquet`"),
+    Column("units", "text or null", "by whose entries, of the most first; null: the fusion does not say"),
+    Column("object_class", "text", "class of its first entry"),
+    Column("track_id", "text or null", "the fusion's track; null: it names none, and entries are linked"),
+    Column("existence", "numbers", "its highest"),
+    Column("x_m", "numbers", "listed place of its first entry, east"),
+    Column("y_m", "numbers", "the same, north"),
+    Column("to_x_m", "numbers", "listed place of its last entry, east"),
+    Column("to_y_m", "numbers", "the same, north"),
+)  # fmt: skip
 _THRESHOLDS = (
     *_LOG, _RUN, _OBJECT, _EPISODE,
     Column("existence", "numbers", "up to which existence asked for the time holds, from that of the row before on",
@@ -308,7 +322,7 @@ _BANDS = (
     Column("to", "numbers", "upper edge, not in the band"),
     Column("looked", "numbers", "object × list pairs looked at"),
     Column("missed_share", "numbers", "share of them without a match"),
-    Column("ghosts", "numbers", "entries at no object"),
+    Column("ghosts", "numbers", "entries about nobody"),
     Column("pairs", "numbers", "matches that have an error"),
     *_as_in_summary("position_rmse_m", "bias_east_m", "bias_north_m", "nees", "nees_expected"),
     Column("entries", "numbers", "entries of measured classes"),
@@ -398,6 +412,9 @@ TABLES = {
     "lists.parquet": Table(f"One row per log, configuration and run. {_FAR_OFF}.", _LISTS),
     "thresholds.parquet": Table(
         f"One row per log, configuration, run, object and step of existence. {_FAR_OFF}.", _THRESHOLDS),
+    "false_tracks.parquet": Table(
+        "One row per log, configuration, run and false track. [Definitions](../guide/metrics.md#false-tracks).",
+        _FALSE_TRACKS),
     "needless.parquet": Table(
         "One row per log, configuration, run and time that the driver brakes for nothing. "
         "[Definitions](../guide/metrics.md#braking-for-nothing).", _NEEDLESS),
@@ -412,7 +429,7 @@ TABLES = {
 """The files of a results folder, beside the experiment and the replays."""
 COMPARED_FILES = ("accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet")
 """Optional files that comparisons read."""
-NEEDLESS = "needless.parquet"
+NEEDLESS, FALSE_TRACKS = "needless.parquet", "false_tracks.parquet"
 
 
 def find_columns(name: str) -> dict[str, Column]:

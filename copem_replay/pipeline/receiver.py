@@ -51,7 +51,7 @@ from copem_replay.fusion.interface import (
     ask_fusion,
     ask_resumed_fusion,
 )
-from copem_replay.metrics.matching import MATCH, Matches
+from copem_replay.metrics.matching import DUPLICATE, MATCH, Matches
 from copem_replay.metrics.origin import (
     GoesBack,
     OriginLists,
@@ -195,7 +195,8 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     )
     none = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
-    return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s)
+    second_of = np.where(matches.role[first:last] == DUPLICATE, matches.object_ix[first:last], -1)[order]
+    return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s, second_of=second_of)
 
 
 # Stated captures: when lists were captured, as fusions are told of it.

@@ -307,13 +307,13 @@ class StudyTables:
         chosen = ((part, pa.array(part.rows["run"].to_numpy() == run)) for part in self.parts(log))
         return self.frame(replace(part, rows=part.rows.filter(of_run)) for part, of_run in chosen)
 
-    def needless_of(self, log: str, run: int) -> pd.DataFrame | None:
-        """The rows of `needless.parquet` of one run of a log; None: not asked for."""
-        tables = [part.needless for part in self.parts(log) if part.needless is not None]
-        if not tables:
-            return None
-        rows = pa.concat_tables(tables)
-        return rows.filter(pa.array(rows["run"].to_numpy() == run)).to_pandas()
+    def events_of(self, log: str, run: int) -> Iterator[pd.DataFrame | None]:
+        """The rows of `needless.parquet`, and of `false_tracks.parquet`, of one run of a log; None: not asked for."""
+        parts = list(self.parts(log))
+        for of_parts in ([part.needless for part in parts], [part.false_tracks for part in parts]):
+            tables = [table for table in of_parts if table is not None]
+            rows = pa.concat_tables(tables) if tables else None
+            yield None if rows is None else rows.filter(pa.array(rows["run"].to_numpy() == run)).to_pandas()
 
     def frame(self, parts: Iterable[PartTables]) -> pd.DataFrame:
         """The rows of some parts, with the columns and types that those of all parts have."""

@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -23,7 +24,9 @@ from copem_replay.metrics.detection.by_match import DetectionSteps, FirstMatches
 from copem_replay.metrics.detection.by_truth_id import FirstDetections
 from copem_replay.metrics.detection.conflict import ConflictDetector
 from copem_replay.metrics.detection.turns import number_turns
-from copem_replay.metrics.matching import MATCH, Matches, match_at_both_times, match_entries
+from copem_replay.metrics.matching import DUPLICATE, GHOST, MATCH, Matches, match_at_both_times, match_entries
+from copem_replay.metrics.origin import Origins
+from copem_replay.pipeline.false_tracks import FalseTracks
 from copem_replay.pipeline.prepare import Replay, TruthCache
 from copem_replay.pipeline.receiver import ReceiverOutput
 
@@ -32,8 +35,8 @@ from copem_replay.pipeline.receiver import ReceiverOutput
 class ConfigurationScores:
     """The scores of one configuration in the runs (S,), or in the one that stands for all.
 
-    `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`: with
-    `accuracy`; `needless`: with it where a driver is asked.
+    `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`,
+    `false_tracks`: with `accuracy`; `needless`: with it where a driver is asked.
     """
 
     issue_s: Float
@@ -42,6 +45,7 @@ class ConfigurationScores:
     accuracy: Accuracy | None
     held: HeldAccuracy | None = None
     needless: NeedlessBraking | None = None
+    false_tracks: pd.DataFrame | None = None
 
 
 def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
@@ -79,6 +83,14 @@ def _list_captures(output: ReceiverOutput) -> Float:
     return captures[used[:-1]]
 
 
+def tell_who_is_false(matches: Matches, origins: Origins) -> Matches:
+    """The matches with those false alone that are about nobody: an entry with an id is about it, however far off."""
+    if not len(origins.own_ix):
+        return matches
+    about = (matches.role == GHOST) & (origins.own_ix >= 0)
+    return replace(matches, role=np.where(about, np.int8(DUPLICATE), matches.role))
+
+
 class Judge:
     """Measures what the receiver of one configuration issues, chunk by chunk: detection, accuracy and conflicts.
 
@@ -95,6 +107,7 @@ class Judge:
         self._aggregator: Aggregator | None = None
         self._held: HeldErrors | None = None
         self._needless: NeedlessDetector | None = None
+        self._false: FalseTracks | None = None
         self._conflicts: ConflictDetector | None = None
         if measure.conflict is not None:
             self._conflicts = ConflictDetector(
@@ -123,9 +136,11 @@ class Judge:
             lists, (matches, now) = output.lists, both
             if not self._known:
                 self._begin(around, output)
-            if self._aggregator is not None and self._held is not None:
+            if self._aggregator is not None and self._held is not None and self._false is not None:
                 began_s = time.perf_counter()
-                self._aggregator.add(lists, matches, now, around.at(issue_s))
+                about = tell_who_is_false(matches, output.origins)
+                self._aggregator.add(lists, about, now, around.at(issue_s))
+                self._false.add(lists, about)
                 self._held.add(lists, matches)
                 self.accuracy_s += time.perf_counter() - began_s
             if len(object_ix := output.origins.own_ix):  # known by truth ids, however far off
@@ -158,6 +173,7 @@ class Judge:
         self._held = HeldErrors(
             self._log.held_frames, issue_s, self._max_age_s, scene, firsts, classes, settings=settings, runs=runs
         )
+        self._false = FalseTracks(issue_s, reference, classes, settings, self._max_age_s, output.received.units)
         if (truth := self._log.truth_demand) is not None:
             self._needless = NeedlessDetector(
                 truth, issue_s, reference, settings, confirm=measure.confirm, max_age_s=self._max_age_s, runs=runs
@@ -175,7 +191,8 @@ class Judge:
         accuracy = None if self._aggregator is None else repeat_for_runs(self._aggregator.result(), runs)
         held = None if self._held is None else self._held.result().repeated(runs)
         needless = None if self._needless is None else self._needless.result().repeated(runs)
-        return ConfigurationScores(self._issue_s, detections, steps, accuracy, held, needless)
+        false = None if self._false is None else self._false.result(runs)
+        return ConfigurationScores(self._issue_s, detections, steps, accuracy, held, needless, false)
 
     def _join_known(self) -> tuple[FirstDetections, DetectionSteps]:
         """The detections of all episodes, and their steps in the order of runs and episodes."""

@@ -5,6 +5,7 @@
 | `accuracy` | as `detections`: position error and part of GOSPAᵖ by list of the stay, and as held by frame; ghosts |
 | `instants` | log × configuration, and run where runs differ in them: when lists are available, which are held |
 | `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
+| `false_tracks` | log × configuration × run × false track: when, where, how many entries, whose |
 | `needless` | log × configuration × run × time that the driver brakes for nothing: when, how long, by whose entry |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |
 | `bands` | configuration × distance, time (by log) or existence: from, to, and the figures in between |
@@ -35,8 +36,9 @@ from copem_replay.metrics.accuracy.statistics import (
     AccuracyTotal,
     sum_accuracy,
 )
-from copem_replay.metrics.columns import COMPARED_FILES, NEEDLESS, TABLES
+from copem_replay.metrics.columns import COMPARED_FILES, FALSE_TRACKS, NEEDLESS, TABLES
 from copem_replay.metrics.detections_table import WAY, build_frame, concatenate_columns
+from copem_replay.pipeline.false_tracks import SORTED
 
 if TYPE_CHECKING:
     from copem_replay.experiment.schema import Experiment
@@ -120,9 +122,10 @@ def accuracy_tables(parts: Iterable[PartTables], rows: pd.DataFrame, *, same_ins
     for column in _STEPS:
         thresholds = thresholds.append_column(column.name, pc.list_flatten(beside[column.name]))
     instants, lists = _build_instants(runs, same_instants), runs.drop_columns(_INSTANTS)
+    false = pa.concat_tables([part.false_tracks for part in parts if part.false_tracks is not None])
     needless = [part.needless for part in parts if part.needless is not None]
     lists = lists if needless else lists.drop_columns(_DRIVING)
-    tables = dict(zip(COMPARED_FILES, (per_list, instants, lists, thresholds), strict=True))
+    tables = dict(zip(COMPARED_FILES, (per_list, instants, lists, thresholds), strict=True)) | {FALSE_TRACKS: false}
     return tables | ({NEEDLESS: pa.concat_tables(needless)} if needless else {})
 
 
@@ -186,7 +189,9 @@ _BY_LIST, _AT, _, _STEPS = (
 )
 _INSTANTS = [column.name for column in _AT]
 _DRIVING = [column.name for column in TABLES["lists.parquet"].columns if column.when == "needless"]
-_EVENTS = pa.schema([(column.name, column.arrow) for column in TABLES[NEEDLESS].columns])
+_EVENTS, _FALSE = (
+    pa.schema([(column.name, column.arrow) for column in TABLES[name].columns]) for name in (NEEDLESS, FALSE_TRACKS)
+)
 _RUNS = pa.schema([(column.name, column.arrow) for column in (*TABLES["lists.parquet"].columns, *_AT)])
 _BESIDE = pa.schema([*((c.name, c.arrow) for c in _BY_LIST), *((c.name, pa.large_list(c.arrow)) for c in _STEPS)])
 
@@ -197,9 +202,9 @@ class PartTables:
 
     `beside` has the rows of `rows`: the columns of `accuracy.parquet`, and in lists the steps of
     `thresholds.parquet`. `runs` has a row per run: the columns of `lists.parquet`, and those of `instants.parquet`;
-    null: as in the row before. `total`: sums of accuracy over the runs. All three are None without accuracy.
-    `needless`: rows of `needless.parquet`; None: not asked for. `again`: reads the part again where it is kept in a
-    folder; None: it is not.
+    null: as in the row before. `total`: sums of accuracy over the runs. `false_tracks`: rows of `false_tracks.parquet`.
+    All four are None without accuracy. `needless`: rows of `needless.parquet`; None: not asked for. `again`: reads the
+    part again where it is kept in a folder; None: it is not.
     """
 
     log: str
@@ -208,6 +213,7 @@ class PartTables:
     beside: pa.Table | None = None
     runs: pa.Table | None = None
     total: AccuracyTotal | None = None
+    false_tracks: pa.Table | None = None
     needless: pa.Table | None = None
     again: Callable[[], PartTables] | None = field(default=None, compare=False, repr=False)
 
@@ -219,7 +225,7 @@ class PartTables:
     @property
     def tables(self) -> tuple[pa.Table | None, ...]:
         """Its tables, those that it has first."""
-        return self.rows, self.beside, self.runs, self.needless
+        return self.rows, self.beside, self.runs, self.false_tracks, self.needless
 
 
 def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experiment) -> list[PartTables]:
@@ -237,7 +243,8 @@ def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experime
         if experiment.measure.accuracy:
             beside, runs = _build_beside(outcomes, name).take(pa.array(order)), _build_runs(outcomes, name)
             accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda one: one[0])]
-            part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies))
+            false = _tabulate_false_tracks(outcomes, name)
+            part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies), false_tracks=false)
         if experiment.needless is not None:
             part = replace(part, needless=_tabulate_needless(outcomes, name))
         parts.append(part)
@@ -381,6 +388,17 @@ def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
     return pa.concat_tables(parts).sort_by([("run", "ascending"), ("begins_s", "ascending")])
 
 
+def _tabulate_false_tracks(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
+    """`PartTables.false_tracks` of a configuration."""
+    parts = []
+    for outcome in outcomes:
+        found = outcome.all_scores[name].false_tracks
+        assert found is not None
+        whose = found.assign(log=outcome.log, configuration=name, run=outcome.runs[found["run"].to_numpy()])
+        parts.append(pa.Table.from_pandas(whose, schema=_FALSE, preserve_index=False).replace_schema_metadata(None))
+    return pa.concat_tables(parts).sort_by([(column, "ascending") for column in SORTED])
+
+
 # Parts as bytes: streams of Arrow, one after the other.
 
 _WHOSE = ("log", "configuration")
@@ -414,13 +432,13 @@ def unpack_part(content: bytes, log: str, configuration: str, about: str = "") -
     if metadata[b"about"] != about.encode():
         raise ValueError("another recipe")
     total = parse_json(metadata[b"total"])
-    for k in (place for place in (0, 2, 3) if place < len(tables)):
+    for k in (place for place in (0, 2, 3, 4) if place < len(tables)):
         for at, (name, value) in enumerate(zip(_WHOSE, (log, configuration), strict=True)):
             column = pa.repeat(pa.scalar(value, pa.string()), len(tables[k]))
             tables[k] = tables[k].replace_schema_metadata(None).add_column(at, name, column)
-    rows, beside, runs, needless = (*tables, None, None, None)[:4]
+    rows, beside, runs, false, needless = (*tables, None, None, None, None)[:5]
     of_runs = None if total is None else _total_from_json(total)
-    return PartTables(log, configuration, rows, beside, runs, of_runs, needless)
+    return PartTables(log, configuration, rows, beside, runs, of_runs, false, needless)
 
 
 def _total_as_json(total: AccuracyTotal) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from copem_replay.results.folder import MARK
 from copem_replay.results.seals import read_seals
 from copem_replay.results.table_files import AGAIN
 
-FORMAT = 5
+FORMAT = 6
 """The format of results folders: raised when columns, files or their meaning change so that readers have to know."""
 
 _LIBRARIES = (

@@ -36,7 +36,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.columns import COMPARED_FILES, NEEDLESS, TABLES
+from copem_replay.metrics.columns import COMPARED_FILES, FALSE_TRACKS, NEEDLESS, TABLES
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
 from copem_replay.pipeline.one_run import (
@@ -74,10 +74,9 @@ if TYPE_CHECKING:
 class RunToExport:
     """One run of one log, in the configurations that are shown.
 
-    `one`: the replayed run. `every`: all configurations of the experiment, whose order determines colours. `table`: the
-    rows of `detections.parquet` of this log and run, of the first episode of each object. `needless`: those of
-    `needless.parquet`, None: not asked for. `summary`: over all logs and runs. `manifest`: the provenance that the file
-    states.
+    `one`: the replayed run. `every`: all configurations of the experiment, whose order determines colours. `table`,
+    `needless`, `false_tracks`: the rows of these files of this log and run, None: not asked for. `summary`: over all
+    logs and runs. `manifest`: the provenance that the file states.
     """
 
     recording: Recording
@@ -88,6 +87,7 @@ class RunToExport:
     summary: pd.DataFrame
     manifest: dict[str, str]
     needless: pd.DataFrame | None = None
+    false_tracks: pd.DataFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     from copem_replay.io.write.mcap import write_mcap
     from copem_replay.io.write.message_family import find_family
 
-    recording, show = run.recording, run.replayed.experiment.show
+    recording, show, table = run.recording, run.replayed.experiment.show, first_episodes(run.table)
     with fetch_place(recording.place) as here:
         stamps = read_file_stamps(here)
         has_digest = recording.sha256 is not None or recording.stamps is not None
@@ -124,11 +124,11 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             here,
             run.replayed.replay.scene,
             run.replayed.run_tracks,
-            run.table,
+            table,
             run.manifest,
             find_family(recording),
             recording.window,
-            draw_truth(run.replayed, run.table) if show is None or show.truth else None,
+            draw_truth(run.replayed, table) if show is None or show.truth else None,
             configuration_colours(run.every, truths={name for name, of in run.every.items() if of.units == TRUTH}),
         )
         check_files_unchanged(stamps)
@@ -202,8 +202,8 @@ def list_results(
     files = [EXPERIMENT, MARK, "summary.csv", "logs.csv", "read.csv", *tables]
     files += ["exact.parquet"] * experiment.measure.exact + ["sweep.csv"] * any(True for _ in list_points(experiment))
     files += ["summary_by.csv"] * bool(experiment.measure.by)
-    files += [name for name in COMPARED_FILES if experiment.measure.accuracy]
-    files += ["bands.csv"] * experiment.measure.accuracy + [NEEDLESS] * (experiment.needless is not None)
+    files += [name for name in (*COMPARED_FILES, FALSE_TRACKS, "bands.csv") if experiment.measure.accuracy]
+    files += [NEEDLESS] * (experiment.needless is not None)
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
         for stem in list_stems(experiment):
             place, shown_count = _place_stem(stem, log, recordings), _count_with_views(experiment)
@@ -354,10 +354,10 @@ def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToE
         shown,
         replay_run(recording, shown_experiment, shown.run, replay),
         experiment.configurations,
-        first_episodes(rows[rows["configuration"].isin(names)]),
+        rows[rows["configuration"].isin(names)],
         study.summary[study.summary["configuration"].isin(names)],
         manifest,
-        study.needless_of(log, shown.run),
+        *study.events_of(log, shown.run),
     )
 
 

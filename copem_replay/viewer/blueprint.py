@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ import pandas as pd
 
 from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
+from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
@@ -66,8 +67,9 @@ class RecordingContent:
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
     Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
     names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
-    `opens_s`: the instant at which the recording opens. `false`: how many false entries each configuration had;
-    `brief`: objects that are known too briefly for words in a lane. `of_one`: all configurations are of one experiment.
+    `opens_s`: the instant at which the recording opens. `counted`: rows of the table that count, of all passes;
+    `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that are known too briefly for
+    words in a lane. `of_one`: all configurations are of one experiment.
     """
 
     replay: Replay
@@ -85,7 +87,8 @@ class RecordingContent:
     baseline: str | None = None
     too_short: Sequence[str] = ()
     opens_s: float | None = None
-    false: Mapping[str, int] = field(default_factory=dict)
+    counted: pd.DataFrame | None = None
+    false_tracks: pd.DataFrame | None = None
     brief: Collection[int] = ()
     of_one: bool = True
 
@@ -105,12 +108,26 @@ class RecordingContent:
     def title(self, configuration: str, mark: str = " · ") -> str:
         """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `mark`: after the name.
 
-        False entries are left out as long as they are not counted.
+        Of the objects that count, in all their passes, and of false tracks, where they are known: what tables count.
         """
-        rows = self.table[self.table["configuration"] == configuration]
-        counts = [f"{rows['detected'].sum()} of {len(rows)} known"] if len(rows) else []
-        counts += [f"{self.false[configuration]} false"] if configuration in self.false else []
+        counted, false = (
+            None if of is None else of[of["configuration"] == configuration] for of in (self.counted, self.false_tracks)
+        )
+        counts = (
+            [f"{counted['detected'].sum()} of {len(counted)} known"] if counted is not None and len(counted) else []
+        )
+        counts += [f"{len(false)} false"] if false is not None else []
         return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
+
+    def tell_false(self) -> str:
+        """The false tracks of each configuration, the longest first, in Markdown."""
+        if self.false_tracks is None:
+            return "False tracks are not known: `accuracy: false`, or configurations are compared."
+        parts = [
+            f"**{name}**: {describe_false_tracks(self.false_tracks[self.false_tracks['configuration'] == name])}"
+            for name in self.configurations
+        ]
+        return "\n\n".join(["False tracks, about nobody, of this run, the longest first", *parts])
 
     def helps(self, object_ix: int) -> str:
         """What would help with an object; “” where configurations are of several experiments: PEMs may differ, too."""
@@ -320,6 +337,7 @@ def text_page() -> rrb.Container:
         rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=kinds)),
         rrb.Tabs(
             rrb.TextDocumentView(origin="summary", name="Summary of all runs"),
+            rrb.TextDocumentView(origin="false", name="False tracks"),
             rrb.TextDocumentView(origin="words", name="What all of it means"),
         ),
         name="In words",

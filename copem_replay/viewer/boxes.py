@@ -189,52 +189,39 @@ def write_fused_boxes(
     _write_covariance(out, [*path, "covariance"], tracks, colour)
 
 
-class FalseEntries:
-    """Draws entries about no object as dashed outlines with a cross over their boxes, names and counts them.
-
-    An entry that the fusion follows counts once, whenever it is about no object; of those without an identity, as many
-    count as are in one list.
+class EntriesBeside:
+    """Draws entries that are no object's match: false ones as dashed outlines with a cross over their boxes, with
+    names; second entries of somebody, and what does not count as false, as thin outlines at their places.
     """
 
     def __init__(self, out: RecordingSink, name: str, colour: Rgb, picture: MovingPicture | None) -> None:
         self._out, self._name, self._colour, self._picture = out, name, colour, picture
-        self._path = ["world", configuration_part(name), "false"]
-        self._tracks: set[int] = set()
-        self._at_once = 0
-        self._shown = False
+        self._shown = {"false": False, "second": False}
 
-    @property
-    def count(self) -> int:
-        """How many there were so far."""
-        return len(self._tracks) + self._at_once
+    def add(self, fused_tracks: FusedTracks, false: Bool) -> None:
+        """Write those of the next time chunk, `false (P,)` or not. A list without any has an empty row, if one before
+        had some.
+        """
+        tracks = fused_tracks.fused
+        second = tracks.valid[0] & (tracks.row_object_ix < 0) & ~false
+        for kind, rows_of, outlines in (("false", false, _cross_corners), ("second", second, _outline)):
+            if rows_of.any() or self._shown[kind]:
+                self._write(kind, tracks, rows_of, outlines)
 
-    def add(self, fused_tracks: FusedTracks) -> None:
-        """Write those of the next time chunk. A list without any has an empty row, if one before had some."""
+    def _write(self, kind: str, tracks: Tracks, kept: Bool, outlines: Callable[[Tracks, Int], np.ndarray]) -> None:
         import rerun as rr
 
-        tracks = fused_tracks.fused
-        false = tracks.valid[0] & (tracks.row_object_ix < 0)
-        if not false.any() and not self._shown:
-            return
-        self._count(fused_tracks, np.flatnonzero(false))
-        for rows, counts, available_ns in slice_by_frame(tracks, false):
-            strips = rr.LineStrips3D.columns(strips=join_points(_outline_corners(tracks, rows)))
-            self._out.columns(self._path, available_ns, strips.partition(counts * _LINES))
-            if self._picture is not None:
+        path, lines = ["world", configuration_part(self._name), kind], _LINES if kind == "false" else 1
+        for rows, counts, available_ns in slice_by_frame(tracks, kept):
+            strips = rr.LineStrips3D.columns(strips=join_points(outlines(tracks, rows)))
+            self._out.columns(path, available_ns, strips.partition(counts * lines))
+            if kind == "false" and self._picture is not None:
                 place_m = np.stack([tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]])
                 write_false_words(self._out, self._name, self._picture, available_ns, counts, place_m)
-        if not self._shown:
-            self._out.static(
-                self._path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=rr.Radius.ui_points(1.2))
-            )
-        self._shown = True
-
-    def _count(self, fused_tracks: FusedTracks, rows: Int) -> None:
-        said = fused_tracks.said
-        track_id = np.full(len(rows), -1) if said is None else said["track_id"][rows]
-        self._tracks.update(np.unique(track_id[track_id >= 0]).tolist())
-        frames = fused_tracks.fused.frame_ix[rows[track_id < 0]]
-        self._at_once = max(self._at_once, int(np.bincount(frames).max(initial=0)))
+        if not self._shown[kind]:
+            radius = rr.Radius.ui_points(1.2 if kind == "false" else 0.6)
+            self._out.static(path, rr.LineStrips3D.from_fields(colors=[self._colour], radii=radius))
+        self._shown[kind] = True
 
 
 _DASH = 0.3
@@ -245,20 +232,26 @@ _LINES = 6
 """Lines of a false entry, of three points each: its corners, and two of the cross."""
 
 
-def _outline_corners(tracks: Tracks, rows: Int) -> np.ndarray:
-    """(R, `_LINES`, 3, 3) points of the lines of false entries, at the height of their tops; crosses reach beyond."""
+def _find_corners(tracks: Tracks, rows: Int) -> Float:
+    """(R, 4, 3) corners of boxes, at the height of their tops."""
     along = np.array([1.0, -1.0, -1.0, 1.0]) * tracks.length_m[0, rows, None] / 2
     across = np.array([1.0, 1.0, -1.0, -1.0]) * tracks.width_m[0, rows, None] / 2
     cos, sin = np.cos(tracks.yaw_rad[0, rows, None]), np.sin(tracks.yaw_rad[0, rows, None])
     top_m = np.broadcast_to((tracks.z_m[0, rows] + tracks.height_m[0, rows] / 2)[:, None], along.shape)
-    corner = np.stack(
-        [
-            tracks.x_m[0, rows, None] + cos * along - sin * across,
-            tracks.y_m[0, rows, None] + sin * along + cos * across,
-            top_m,
-        ],
-        axis=-1,
-    )  # (R, 4, 3)
+    x_m = tracks.x_m[0, rows, None] + cos * along - sin * across
+    y_m = tracks.y_m[0, rows, None] + sin * along + cos * across
+    return np.stack([x_m, y_m, top_m], axis=-1)
+
+
+def _outline(tracks: Tracks, rows: Int) -> np.ndarray:
+    """(R, 1, 5, 3) points of the closed outlines of boxes."""
+    corner = _find_corners(tracks, rows)
+    return np.concatenate([corner, corner[:, :1]], axis=1)[:, None].astype(np.float32)
+
+
+def _cross_corners(tracks: Tracks, rows: Int) -> np.ndarray:
+    """(R, `_LINES`, 3, 3) points of the lines of false entries, at the height of their tops; crosses reach beyond."""
+    corner = _find_corners(tracks, rows)
     dashes = [corner + _DASH * (np.roll(corner, way, axis=1) - corner) for way in (1, -1)]
     corners = np.stack([dashes[0], corner, dashes[1]], axis=2)
     middle = corner.mean(axis=1, keepdims=True)

@@ -22,11 +22,10 @@ import pyarrow.compute as pc
 
 from copem_replay.core.colours import TRUTH, Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.geometry import are_in_area, polygon_corners
 from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_NS, SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.accuracy.statistics import AccuracySettings
+from copem_replay.metrics.accuracy.statistics import are_annotated
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.metrics.gospa import gospas_m
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
@@ -169,6 +168,19 @@ def write_known_count(
     out.static(path, rr.SeriesLines(names=name, colors=colours, widths=width, interpolation_mode=until_next))
 
 
+def find_false_rows(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) -> Bool:
+    """(P,) whether each entry of one run is false: about nobody, of a measured class, in the annotated area."""
+    scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
+    false: Bool = fused.valid[0] & (fused.row_object_ix < 0)
+    false &= replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)]
+    if fused_tracks.second_of is not None:
+        false &= fused_tracks.second_of < 0
+    if measure.annotated is not None:
+        near, settings = replay.truth_cache.reference(fused.common_arrives_s), accuracy_settings(measure, scene.end_s)
+        false &= are_annotated(fused.x_m[0], fused.y_m[0], fused.frame_ix, near, settings)
+    return false
+
+
 def measure_gospa(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) -> tuple[Int, Float]:
     """GOSPA (m) of each list (K,) at the instant (K,) at which it is available.
 
@@ -179,13 +191,12 @@ def measure_gospa(replay: Replay, experiment: Experiment, fused_tracks: FusedTra
     settings = accuracy_settings(measure, scene.end_s)
     numbers = np.arange(len(scene.object_ids) + 1)  # the last: no object
     measured = np.isin(numbers, measured_objects(scene, measure)) & ~np.isin(numbers, replay.outside_ix)
-    ghosts = replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)] & (fused.row_object_ix < 0)
-    if measure.annotated is not None:
-        ghosts &= _is_annotated(replay, fused, settings)
+    ghosts, about = find_false_rows(replay, experiment, fused_tracks), fused.row_object_ix
+    about = about if fused_tracks.second_of is None else np.maximum(about, fused_tracks.second_of)
     near_s, gap_s = fused.common_arrives_s, experiment.max_gap_s + AROUND_S
     near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
     truth = near.take_tracks(measured[near.object_ix])
-    rows, listed = sort_by_frame(fused, fused.valid[0] & (measured[fused.row_object_ix] | ghosts))
+    rows, listed = sort_by_frame(fused, fused.valid[0] & (measured[about] | ghosts))
     elapsed, starts = elapsed_ns(fused), np.append(0, np.cumsum(listed))
     value_m = np.empty(len(listed))
     listed_m = np.stack([fused.x_m[0, rows], fused.y_m[0, rows]])
@@ -199,20 +210,6 @@ def measure_gospa(replay: Replay, experiment: Experiment, fused_tracks: FusedTra
             true_m, bounds, listed_m, starts[first : first + len(stamps) + 1], settings.cutoff_m, settings.power
         )
     return elapsed, value_m
-
-
-def _is_annotated(replay: Replay, fused: Tracks, settings: AccuracySettings) -> Bool:
-    """(P,) whether each entry of one run is in the annotated area."""
-    near = replay.truth_cache.reference(fused.common_arrives_s)
-    f = fused.frame_ix
-    return are_in_area(
-        fused.x_m[0],
-        fused.y_m[0],
-        near.x_m[f],
-        near.y_m[f],
-        polygon_corners(settings.annotated_m),
-        settings.annotated_range_m,
-    )
 
 
 def write_gospa(

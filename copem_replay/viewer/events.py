@@ -106,6 +106,27 @@ def write_needless_braking(
     out.static(path, rr.Points3D.from_fields(colors=[colour], radii=size, show_labels=True))
 
 
+def write_false_tracks(out: RecordingSink, replay: Replay, name: str, false_tracks: pd.DataFrame) -> None:
+    """Write an event for each false track of a configuration in one run: where, for how long, by whose entries."""
+    import rerun as rr
+
+    begins_s = false_tracks["begins_s"].to_numpy(dtype=float)
+    try:
+        near = replay.truth_cache.reference(begins_s)
+        away_m = np.hypot(false_tracks["x_m"] - near.x_m, false_tracks["y_m"] - near.y_m).to_numpy(dtype=float)
+    except ExperimentError:  # no distances are measured
+        away_m = np.full(len(begins_s), np.nan)
+    text = [
+        f"{name}: false {row.object_class}"
+        + (f", {away:.0f} m away" if np.isfinite(away) else "")
+        + f", for {row.lasts_s:.2f} s"
+        + (f", by {row.units}" if not pd.isna(row.units) else "")
+        for row, away in zip(table_rows(false_tracks), away_m.tolist(), strict=True)
+    ]
+    columns = rr.TextLog.columns(text=text, level=["WARN"] * len(text))
+    out.columns(["events", configuration_part(name), "false"], to_nanoseconds(begins_s), columns)
+
+
 def _name_object(episode: Any, scene: Scene) -> str:
     return f"{short_ids(scene)[scene.object_number[episode.object_id]]} {episode.object_class}"
 

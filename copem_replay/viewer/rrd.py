@@ -19,6 +19,8 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Tracks, splice_rows
 from copem_replay.experiment.schema import Experiment
+from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
@@ -45,6 +47,7 @@ from copem_replay.viewer.events import (
     mark_onsets,
     write_difference_text,
     write_event_texts,
+    write_false_tracks,
     write_legend_text,
     write_needless_braking,
     write_onset_texts,
@@ -90,6 +93,7 @@ def write_rrd(
     baseline: str | None = None,
     of_one: bool = True,
     needless: pd.DataFrame | None = None,
+    false_tracks: pd.DataFrame | None = None,
     viewer: str | None = None,
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
@@ -102,8 +106,9 @@ def write_rrd(
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
     logs and runs. `run_is`: why this run is shown, part of the recording's name. `baseline`: the configuration to which
     differences are marked. `of_one`: all configurations are of one experiment, so that nothing but their keys differs.
-    `needless`: rows of `needless.parquet` of this log and run.
+    `needless`, `false_tracks`: rows of these tables of this log and run; None: not asked for.
     """
+    counted, table = select_counted(table, experiment.measure.began), first_episodes(table)
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
     truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
@@ -117,8 +122,9 @@ def write_rrd(
         files = []
         for part in parts:
             content = replace(
-                _build_content(replay, experiment, table, part.configurations, shown, first, baseline), of_one=of_one
-            )
+                _build_content(replay, experiment, table, part.configurations, shown, first, baseline),
+                of_one=of_one, counted=counted, false_tracks=false_tracks,
+            )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
@@ -132,7 +138,7 @@ def write_rrd(
                 write_differences(file.out, replay, experiment, compared, table, baseline, objects, file.colours)
         chunks = chain(iter([first]), later_chunks)
         for file in files:
-            _write_needless(file, replay, needless)
+            _write_brakes_and_false_tracks(file, replay, needless, false_tracks)
         del first  # so that only one chunk is held at a time
         _write_chunks(files, chunks, replay, experiment, collector)
         for file in files:
@@ -145,7 +151,8 @@ def write_rrd(
 class _RecordingFile:
     """One of the files: its streams, its content, and the colours of its configurations, in order.
 
-    By configuration, in the time chunks so far: `last_gospa` the last point of its curve, `false` its false entries.
+    By configuration, in the time chunks so far: `last_gospa` the last point of its curve, `beside` what it draws beside
+    the objects.
     `brief`: as in the content, found at the end.
     """
 
@@ -153,7 +160,7 @@ class _RecordingFile:
     content: RecordingContent
     colours: dict[str, Rgb]
     last_gospa: dict[str, tuple[Int, Float]] = field(default_factory=dict)
-    false: dict[str, boxes.FalseEntries] = field(default_factory=dict)
+    beside: dict[str, boxes.EntriesBeside] = field(default_factory=dict)
     brief: set[int] = field(default_factory=set)
 
     @cached_property
@@ -233,6 +240,7 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
     helps = {k: content.helps(k) for k in content.objects}
     write_difference_text(out, replay, rows, helps, further, content.too_short)
     write_summary_text(out, replay, experiment, summary, run, further)
+    out.static(["false"], rr.TextDocument(content.tell_false(), media_type=rr.MediaType.MARKDOWN))
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
     chosen = content.table[content.table["object_id"].isin([scene.object_ids[k] for k in content.objects])]
@@ -256,19 +264,20 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
         curves.write_known_count(out, replay, "truth", replay.truth)
 
 
-def _write_needless(file: _RecordingFile, replay: Replay, needless: pd.DataFrame | None) -> None:
-    """Write when the driver brakes for nothing, of each configuration."""
-    if needless is None:
-        return
-    for name, rows in needless.groupby("configuration", sort=False):
-        if (colour := file.colours.get(str(name))) is not None:
-            write_needless_braking(file.out, replay, str(name), rows, colour)
+def _write_brakes_and_false_tracks(
+    file: _RecordingFile, replay: Replay, needless: pd.DataFrame | None, false_tracks: pd.DataFrame | None
+) -> None:
+    """Write when the driver brakes for nothing, and when lists begin to hold a false track, of each configuration."""
+    for name, colour in file.colours.items():
+        if needless is not None and len(rows := needless[needless["configuration"] == name]):
+            write_needless_braking(file.out, replay, name, rows, colour)
+        if false_tracks is not None and len(rows := false_tracks[false_tracks["configuration"] == name]):
+            write_false_tracks(file.out, replay, name, rows)
 
 
 def _send_layout(file: _RecordingFile) -> None:
-    """Write the layout, whose titles count false entries; active, so that no viewer replaces it by a guess."""
-    counts = {name: false.count for name, false in file.false.items()}
-    panels = build_blueprint(replace(file.content, false=counts, brief=file.brief))
+    """Write the layout; active, so that no viewer replaces it by a guess."""
+    panels = build_blueprint(replace(file.content, brief=file.brief))
     file.out.send(lambda rec: rec.send_blueprint(panels, make_active=True))
 
 
@@ -296,7 +305,8 @@ def _write_fused(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]) ->
     for name, colour in file.colours.items():
         path = ["world", configuration_part(name)]
         boxes.write_fused_boxes(out, path, content.replay.scene, run_tracks[name], colour)
-        file.false.setdefault(name, boxes.FalseEntries(out, name, colour, file.picture)).add(run_tracks[name])
+        beside = file.beside.setdefault(name, boxes.EntriesBeside(out, name, colour, file.picture))
+        beside.add(run_tracks[name], curves.find_false_rows(content.replay, content.experiment, run_tracks[name]))
         if len(content.replay.episodes.object_ix):
             before = file.last_gospa.get(name, curves.NO_LIST)
             file.last_gospa[name] = curves.write_gospa(
@@ -394,6 +404,7 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
             run.shown.run,
             run_is=run.shown.why,
             needless=run.needless,
+            false_tracks=run.false_tracks,
             viewer=viewer,
         )
 

@@ -19,7 +19,7 @@ from copem_replay.core.files import remove_leftovers
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.recording import Recording
-from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.metrics.columns import FALSE_TRACKS
 from copem_replay.perception.pem.model import Pem
 from copem_replay.pipeline.one_run import ReplayedRun
 from copem_replay.pipeline.prepare import prepare_log
@@ -172,6 +172,7 @@ def write_side_by_side(
         run_is=f"differences to {labels[0]}",
         baseline=labels[0],
         of_one=len(used) == 1,
+        false_tracks=_join_false_tracks(sides, log, shown_run),
     )
     return [f"{path}: {line}" for line in _note_other_worlds(sides)]
 
@@ -251,7 +252,17 @@ def _replay_side(results: Results, chosen: Sequence[LabelledConfiguration], log:
     """One folder's part of the run, computed again. Raises InputError if its table differs."""
     labels = {replayed.configuration: replayed.label for replayed in chosen}
     replayed, rows = replay_again(results, log, run, labels)
-    return _Side(results, labels, replayed, first_episodes(rows))
+    return _Side(results, labels, replayed, rows)
+
+
+def _join_false_tracks(sides: Sequence[_Side], log: str, run: int) -> pd.DataFrame | None:
+    """The folders' rows of `false_tracks.parquet` of the run; None: one has none."""
+    if not all(side.results.has(FALSE_TRACKS) for side in sides):
+        return None
+    tables = [(side, side.results.frame(FALSE_TRACKS)) for side in sides]
+    labelled = [rows.assign(configuration=rows["configuration"].map(side.labels)) for side, rows in tables]
+    rows = pd.concat(labelled).dropna(subset="configuration")
+    return rows[(rows["log"] == log) & (rows["run"] == run)]
 
 
 def _join_summaries(sides: Sequence[_Side], labels: Sequence[str]) -> pd.DataFrame:

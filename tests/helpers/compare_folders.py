@@ -131,7 +131,7 @@ def write_folder(
     logs = logs or {name: f"content of {name}" for name in names}
     said = {
         "copem_replay": "0",
-        "format": 5,
+        "format": 6,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,
         "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],

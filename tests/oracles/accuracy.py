@@ -255,17 +255,16 @@ def plainly(
                     claim["entries"] += 1
                     claim["existence"] += entry["existence"]
                     claim["with_object"] += about.role[i] != GHOST
-                if role == GHOST and is_measured and not unknown:
+                if about.role[i] == GHOST and is_measured and not unknown:
                     by_run[s]["ghosts"] += 1
-                    if about.role[i] != GHOST:
-                        by_run[s]["stale_ghosts"] += 1
-                    else:
-                        ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
+                    ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
                     for one in bands(s, k, place):
                         one["ghosts"] += 1
                     h = nearest_of(here, place)
                     if h is not None:
                         by_object[s, here[h][0]]["ghosts"] += 1
+                if role == GHOST and is_measured and not unknown:
+                    by_run[s]["stale_ghosts"] += about.role[i] != GHOST
                     estimates.append(place)
                 elif role != GHOST and o in [episodes.object_ix[m] for m, _ in here]:
                     estimates.append(place)

@@ -259,7 +259,7 @@ class TestCommand:
             ("provenance.json", b"{", "/provenance.json: expected the provenance of results, found damage: "),
             (
                 "provenance.json",
-                b'{"format": 5}',
+                b'{"format": 6}',
                 "/provenance.json: expected the provenance of results, found damage: no 'logs'",
             ),
             ("summary.csv", b"a,b\n1,2\n", "/summary.csv: expected the column configuration, found none; run the "),

@@ -34,7 +34,7 @@ def test_an_older_format_is_refused(older: Path, name: str) -> None:
     with pytest.raises(cr.InputError) as failure:
         getattr(cr, name)(older)
     again = "run the experiment again with --overwrite"
-    assert failure.value.problems == (f"{older}: expected results of format 5, found format 1; {again}",)
+    assert failure.value.problems == (f"{older}: expected results of format 6, found format 1; {again}",)
 
 
 @pytest.mark.parametrize("read", [cr.load_results, cr.compare])

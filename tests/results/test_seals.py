@@ -166,7 +166,7 @@ def test_a_bit_anywhere_in_the_provenance_is_found_or_changes_nothing(folder: Pa
             unsealed += 1
         file.write_bytes(content)
     assert unsealed <= 8 * len("sha256")
-    assert all(line.startswith((f"{file}: expected ", f"{folder}: expected results of format 5")) for line in refused)
+    assert all(line.startswith((f"{file}: expected ", f"{folder}: expected results of format 6")) for line in refused)
 
 
 @pytest.mark.parametrize("name", ["provenance.json", "detections.parquet"])

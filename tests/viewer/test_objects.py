@@ -39,9 +39,7 @@ def ready(**things: tuple[float, float]) -> tuple[Replay, Experiment]:
     return prepare_log(scene, asked), asked
 
 
-def table(
-    *rows: tuple[str, float, float, float | None, float | None], uncounted: tuple[str, ...] = ()
-) -> pd.DataFrame:
+def table(*rows: tuple[str, float, float, float | None, float | None], uncounted: tuple[str, ...] = ()) -> pd.DataFrame:
     """Of each object id, onset and end, and when x and y know it; the truth knows it at once."""
     found: list[dict[str, Any]] = []
     for name, onset_s, ended_s, *known in rows:
@@ -66,7 +64,9 @@ def shown(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
 def test_difference_times_nearness() -> None:
     """2 m, 20 m and 60 m from the path: 1.04, 5 and 37 times less than on it; y is 2, 4 and 8 s later than x."""
     on_time = (("early", 2.0, 10.0, 2.0, 2.0), ("alike", 2.0, 10.0, 2.2, 2.2), ("short", 2.0, 10.0, 2.5, 2.5))
-    rows = table(("near", 2.0, 10.0, 2.0, 4.0), ("beside", 2.0, 10.0, 2.0, 6.0), ("far", 2.0, 10.0, 2.0, None), *on_time)
+    rows = table(
+        ("near", 2.0, 10.0, 2.0, 4.0), ("beside", 2.0, 10.0, 2.0, 6.0), ("far", 2.0, 10.0, 2.0, None), *on_time
+    )
     assert shown(rows)[0] == ["near", "beside", "far", "early", "short", "alike"]
     rows = rows.replace({"detection_s": {4.0: 2.8}, "time_to_detection_s": {2.0: 0.8}})
     assert shown(rows)[0][:3] == ["beside", "near", "far"], "(4 − 0.5) s / 5 is more than (0.8 − 0.5) s / 1.04"

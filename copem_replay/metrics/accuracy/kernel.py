@@ -353,26 +353,23 @@ def _add_entries(
             claim.entries += 1
             claim.existence += existence
             claim.with_object += about.role[i] != GHOST
-            if nowhere:
-                stale = about.role[i] != GHOST
+            if about.role[i] == GHOST:
                 _add_false_positive(
-                    s, entries[i].x_m, entries[i].y_m, existence, stale, from_m, time_band, asked, targets, wanted,
-                    out,
-                )  # fmt: skip
+                    s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, asked, targets, wanted, out
+                )
+            elif nowhere:
+                out.by_run[s].stale_ghosts += 1
     return count
 
 
 @borrowing
 def _add_false_positive(
-    s: int, x_m: float, y_m: float, existence: float, stale: bool, from_m: tuple[float, float], time_band: int,
+    s: int, x_m: float, y_m: float, existence: float, from_m: tuple[float, float], time_band: int,
     asked: AccuracyParameters, targets: Targets, wanted: int, out: AccuracySums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
-    if stale:
-        out.by_run[s].stale_ghosts += 1
-    else:
-        for q in range(len(asked.existence_thresholds)):
-            out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
+    for q in range(len(asked.existence_thresholds)):
+        out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
     distance_band = _find_band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
     if distance_band >= 0:
         out.by_distance[s, distance_band].ghosts += 1

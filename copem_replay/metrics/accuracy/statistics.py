@@ -31,13 +31,13 @@ Over an episode, by matches now; an object that is never matched has the worst v
 
 Over all lists:
 
-- ghosts (1): now, of measured classes. Each goes to the nearest object looked at, if there is one. *Stale* are those
-  that were about some object at the instant they tell of.
-- GOSPA (m, α = 2, cut-off c, power p): of what is looked at in a list against the entries that belong to it, and the
-  ghosts; entries of what is not looked at now (an unmeasured object, the ego) are left out. Pairs are the best ones by
-  distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false entry is the part of
-  the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the power 1/p. Never
-  matched: cᵖ/2 in each list.
+- ghosts (1): about nobody at the instant they tell of, of measured classes. Each goes to the nearest object looked at,
+  if there is one. *Stale* entries are about somebody then, and at nobody now; they are no ghosts.
+- GOSPA (m, α = 2, cut-off c, power p): of what is looked at in a list against the entries that belong to it, and those
+  at nobody now, stale or not; entries of what is not looked at now (an unmeasured object, the ego) are left out. Pairs
+  are the best ones by distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false
+  entry is the part of the nearest one looked at. Mean of GOSPAᵖ over the lists in which something is looked at, to the
+  power 1/p. Never matched: cᵖ/2 in each list.
 - where the truth is not annotated an entry that is at no object now is no ghost, and in no GOSPA, OSPA or ghost count;
   one at no object at the instant it tells of does not count for the existence.
 - OSPA (m): of the same two sets; mean over the same lists.
@@ -59,8 +59,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.tracks import Int
+from copem_replay.core.geometry import are_in_area, polygon_corners
+from copem_replay.core.tracks import Bool, Float, Int
 from copem_replay.metrics.accuracy.kernel import Records
+from copem_replay.metrics.episodes import Reference
 
 EXISTENCE_BINS = 10
 """Bins of equal width, as many as in Naeini et al. 2015."""
@@ -133,6 +135,15 @@ class AccuracySettings:
     annotated_range_m: float = np.inf  # radius of the annotated area around the reference
 
 
+def are_annotated(x_m: Float, y_m: Float, list_ix: Int, reference: Reference, settings: AccuracySettings) -> Bool:
+    """(N,) whether places in lists are in the annotated area; `reference`: at the instants of all lists."""
+    if not settings.annotated_m and np.isinf(settings.annotated_range_m):
+        return np.ones(len(list_ix), dtype=bool)
+    from_m, corners = (reference.x_m[list_ix], reference.y_m[list_ix]), polygon_corners(settings.annotated_m)
+    x_m, y_m = np.ascontiguousarray(x_m), np.ascontiguousarray(y_m)
+    return are_in_area(x_m, y_m, *from_m, corners, settings.annotated_range_m)
+
+
 @dataclass(frozen=True)
 class Accuracy:
     """Statistics of S runs, not summed over runs: blocks of any size give the same total."""
@@ -144,7 +155,7 @@ class Accuracy:
     gospa: NDArray[np.float32]  # (S, L) the object's part of GOSPAᵖ; NaN: not looked at
     by_object: Records  # (S, M) of OBJECT
     by_run: Records  # (S,) of RUN
-    ghosts_at: Int  # (S, T) ghosts that are not stale of at least each of the existence thresholds
+    ghosts_at: Int  # (S, T) ghosts of at least each of the existence thresholds
     by_distance: Records  # (S, bands) of BAND
     by_time: Records  # (S, bands) of BAND
     by_existence: Records  # (S, EXISTENCE_BINS) of EXISTENCE

@@ -24,11 +24,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from copem_replay.core.geometry import are_in_area, polygon_corners
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, join_entries, take_entries, view_as_numbers
 from copem_replay.core.tracks import SAME_INSTANT_S, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.metrics.accuracy.statistics import AccuracySettings
+from copem_replay.metrics.accuracy.statistics import AccuracySettings, are_annotated
 from copem_replay.metrics.braking.demand import BrakingEgo
 from copem_replay.metrics.braking.driver import driver_deceleration
 from copem_replay.metrics.config import DUPLICATE_ENTRY, GHOST_ENTRY, LATE, MISPLACED, Confirm, Needless
@@ -188,7 +187,8 @@ class NeedlessDetector:
         )
         which += self._added
         rows = np.flatnonzero(demands & (matches.object_ix != self._truth.scene.ego_ix))
-        rows = rows[self._is_annotated(lists.entries[rows], which[rows])]
+        x_m, y_m = (lists.entries[name][rows] for name in ("x_m", "y_m"))
+        rows = rows[are_annotated(x_m, y_m, which[rows], self._reference, self._settings)]
         run_ix = np.searchsorted(lists.start[:, 0], rows, side="right") - 1
         rows, run_ix = self._choose_surest(lists.entries, rows, run_ix, which)
         entries, k = take_entries(lists.entries, rows), which[rows]
@@ -198,15 +198,6 @@ class NeedlessDetector:
              matches.class_ix[rows].astype(np.int64))
         )  # fmt: skip
         self._added += count
-
-    def _is_annotated(self, entries: Entries, which: Int) -> Bool:
-        settings, reference = self._settings, self._reference
-        if not settings.annotated_m and np.isinf(settings.annotated_range_m):
-            return np.ones(len(which), dtype=bool)
-        from_x_m, from_y_m = reference.x_m[which], reference.y_m[which]
-        x_m, y_m = (np.ascontiguousarray(entries[name]) for name in ("x_m", "y_m"))
-        corners = polygon_corners(settings.annotated_m)
-        return are_in_area(x_m, y_m, from_x_m, from_y_m, corners, settings.annotated_range_m)
 
     def _choose_surest(self, entries: Entries, rows: Int, run_ix: Int, which: Int) -> tuple[Int, Int]:
         """Of each run and list one row: of the highest existence the nearest to the ego."""

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.errors import OutputError, RecordingError
 from copem_replay.core.extras import EXTRAS, has_extra, load_extra
+from copem_replay.metrics.columns import FALSE_TRACKS
+from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.report.figures.answer import answer_figure
 from copem_replay.report.figures.registry import FIGURES
 from copem_replay.report.figures.selection import Selection
@@ -164,6 +166,7 @@ def build_page(study: ReportData) -> str:
         _Section("differences-of-it", "Differences", _difference_parts(study)),
         *_extra_sections(study),
         *_figure_sections(study, _FIRST),
+        *_false_sections(study),
         _Section(
             "configurations-of-it",
             "What is compared",
@@ -189,6 +192,23 @@ def build_page(study: ReportData) -> str:
     return whole_page(
         title, join_html([head, *(make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
     )
+
+
+def _false_sections(study: ReportData) -> Iterator[_Section]:
+    """A list of the false tracks of one run, where it has any."""
+    results, shown = study.results, study.results.provenance.run_shown
+    log = next(iter(shown), results.provenance.logs[0].name)
+    if not results.has(FALSE_TRACKS):
+        return
+    rows = results.frame(FALSE_TRACKS)
+    rows = rows[(rows["log"] == log) & (rows["run"] == shown.get(log, 0))]
+    told = []
+    for name in study.contenders:
+        of_name = rows[rows["configuration"] == name]
+        told.append(join_html([make_tag("b", name), f" {len(of_name)}: {describe_false_tracks(of_name)}"]))
+    if len(rows):
+        words = f"Entries about nobody in run {shown.get(log, 0)} of {log}, the longest first. {FALSE_TRACKS}: all runs."
+        yield _Section("false-tracks", "False tracks", [make_tag("p", words), make_list(told)])
 
 
 def _extra_sections(study: ReportData) -> Iterator[_Section]:
