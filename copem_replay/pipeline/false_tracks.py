@@ -1,9 +1,9 @@
 """False tracks: entries about nobody, put together over the lists that hold them.
 
-An entry is *false* if it is of a measured class, in the annotated area, and about nobody at the instant it tells of, by
-its origin (`metrics/matching.py`): a second entry of somebody is none, nor is one that was true at its capture. A
-*false track* is one as the fusion numbers it; entries without a number are linked to the nearest false track of the
-lists within `PAUSE_S` before that has its last entry within `NEAR_M`, the nearest pairs first.
+An entry is *false* if it is of a measured class, in the annotated area, and about nobody by its origin
+(`metrics/matching.py`), neither at the instant it tells of nor now: a second entry of somebody is not, nor is one that
+was true at its capture. A *false track* is one as the fusion numbers it; entries without a number are linked to the
+nearest false track of the lists within `PAUSE_S` before that has its last entry within `NEAR_M`, nearest pairs first.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ class FalseTracks:
         self._parts = list[tuple[Entries, Int, Int, Int]]()
         self._added = self._of_runs = 0
 
-    def add(self, lists: ObjectLists, about: Matches) -> None:
-        """Add the next lists, and what their entries are about at the instant that they tell of."""
-        rows = np.flatnonzero((about.role == GHOST) & self._measured_class[about.class_ix])
+    def add(self, lists: ObjectLists, about: Matches, now: Matches) -> None:
+        """Add the next lists, and what their entries are about at the instant that they tell of, and now."""
+        false = (about.role == GHOST) & (now.role == GHOST)
+        rows = np.flatnonzero(false & self._measured_class[about.class_ix])
         place = np.searchsorted(lists.start.ravel(), rows, side="right") - 1
         run_ix, list_ix = np.divmod(place, lists.start.shape[1])
         list_ix += self._added

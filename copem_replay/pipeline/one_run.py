@@ -21,7 +21,7 @@ from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
 from copem_replay.pipeline.receiver import Receivers
-from copem_replay.pipeline.scoring import match_lists
+from copem_replay.pipeline.scoring import match_run
 from copem_replay.pipeline.world import Transmission
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class RunTracks:
             truth_cache, result = replay.truth_cache_of(world.chunk), {}
             for name in units.configurations:
                 output = receivers.fuse(world, name)
-                matches = match_lists(truth_cache, output, measure) if output.fused_tracks is None else None
+                matches = match_run(truth_cache, output, measure) if output.fused_tracks is None else None
                 [(_, fused_tracks)] = output.tracks_by_run(matches)
                 if output.faults is not None:
                     fused_tracks = replace(fused_tracks, faults=output.faults)

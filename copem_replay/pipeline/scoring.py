@@ -55,7 +55,7 @@ def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) ->
     return match_entries(output.told, world, around.scene, output.origins, gate_m=gate_m, tells_of=output.tells_of)
 
 
-def _match_at_both_times(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
+def match_lists_twice(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
     """Matches at the instants that entries tell of, and at the instants at which their lists are available."""
     if output.tells_of == "now":
         matches = match_lists(around, output, measure)
@@ -83,12 +83,20 @@ def _list_captures(output: ReceiverOutput) -> Float:
     return captures[used[:-1]]
 
 
-def tell_who_is_false(matches: Matches, origins: Origins) -> Matches:
-    """The matches with those false alone that are about nobody: an entry with an id is about it, however far off."""
+def match_run(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
+    """As `match_lists`, but that an entry about nobody that is at somebody now is a second entry: it is not false."""
+    matches, now = match_lists_twice(around, output, measure)
+    somebody = (matches.role == GHOST) & (now.role != GHOST)
+    role = np.where(somebody, np.int8(DUPLICATE), matches.role)
+    return replace(matches, role=role, object_ix=np.where(somebody, now.object_ix, matches.object_ix))
+
+
+def _match_by_id(matches: Matches, origins: Origins) -> Matches:
+    """The matches, in which an entry that has an id is about whom it names, however far off."""
     if not len(origins.own_ix):
         return matches
-    about = (matches.role == GHOST) & (origins.own_ix >= 0)
-    return replace(matches, role=np.where(about, np.int8(DUPLICATE), matches.role))
+    role = np.where((matches.role == GHOST) & (origins.own_ix >= 0), np.int8(DUPLICATE), matches.role)
+    return replace(matches, role=role)
 
 
 class Judge:
@@ -123,7 +131,7 @@ class Judge:
             return None
         if self._measure.accuracy:
             began_s = time.perf_counter()
-            both = _match_at_both_times(around, output, self._measure)
+            both = match_lists_twice(around, output, self._measure)
             self.accuracy_s += time.perf_counter() - began_s
             return both
         matches = match_lists(around, output, self._measure)
@@ -138,9 +146,9 @@ class Judge:
                 self._begin(around, output)
             if self._aggregator is not None and self._held is not None and self._false is not None:
                 began_s = time.perf_counter()
-                about = tell_who_is_false(matches, output.origins)
+                about = _match_by_id(matches, output.origins)
                 self._aggregator.add(lists, about, now, around.at(issue_s))
-                self._false.add(lists, about)
+                self._false.add(lists, about, now)
                 self._held.add(lists, matches)
                 self.accuracy_s += time.perf_counter() - began_s
             if len(object_ix := output.origins.own_ix):  # known by truth ids, however far off

@@ -168,24 +168,21 @@ def test_latency_counts_in_full_whatever_the_gate(latency_s: float) -> None:
 @pytest.mark.parametrize(("latency_s", "stale_per_min"), [(0.1, 0.0), (0.5, 75.0)])  # 5 in 4 s
 def test_what_a_stale_list_is_worth_now(latency_s: float, stale_per_min: float) -> None:
     of, none = late_by(latency_s), stale_per_min == 0
-    assert (
-        figure("false_positives_per_min", of)
-        == figure("stale_false_positives_per_min", of)
-        == pytest.approx(stale_per_min)
-    )
+    assert figure("stale_false_positives_per_min", of) == pytest.approx(stale_per_min)
+    assert figure("false_positives_per_min", of) == 0.0, "they are about somebody"
     assert of.by_object[0, 0]["missed"] == (0 if none else 5)
     assert figure("longest_gap_s", of) == pytest.approx(1.0 if none else 5.0)
     assert figure("gospa_missed_m", of) == pytest.approx(0.0 if none else math.sqrt(4.5))
 
 
-def test_ghosts_that_are_about_nobody_then_either_are_not_stale_and_only_these_have_thresholds() -> None:
+def test_what_is_about_nobody_now_and_then_is_a_ghost_and_what_was_about_somebody_is_stale() -> None:
     lists = [one_list(entry(10, captured_s=0.0, existence=0.9), entry(50, captured_s=0.0, existence=0.6))] * 2
     captures = ([0.0], {CAR: [(10.0, 0.0)]})
     of = assessed(
         lists, times_s=[1, 2], places={CAR: standing(20, 0, 2)}, episodes={CAR: (1, 2)}, captures=captures,
         existence_thresholds=(0.0, 0.7),
     )  # fmt: skip
-    assert (of.by_run[0]["ghosts"], of.by_run[0]["stale_ghosts"]) == (4, 2)
+    assert (of.by_run[0]["ghosts"], of.by_run[0]["stale_ghosts"]) == (2, 2)
     assert of.ghosts_at.tolist() == [[2, 0]]
     assert of.by_existence["with_object"][0].tolist() == [0] * 9 + [2]
 
@@ -676,7 +673,7 @@ def test_a_stale_entry_where_now_nothing_is_annotated() -> None:
     captures = [-1.0], {CAR: standing(15, 0, 1)}
     given: dict[str, Any] = {"places": {CAR: standing(30, 0, 1)}, "episodes": {CAR: (-2, 0)}, "captures": captures}
     everywhere, inside = (assessed([said], **given, **area).by_run[0] for area in ({}, {"annotated_m": SQUARE}))
-    assert (everywhere["ghosts"], everywhere["stale_ghosts"], everywhere["unannotated"]) == (1, 1, 0)
+    assert (everywhere["ghosts"], everywhere["stale_ghosts"], everywhere["unannotated"]) == (0, 1, 0)
     assert (inside["ghosts"], inside["stale_ghosts"], inside["unannotated"]) == (0, 0, 1)
 
 

@@ -255,7 +255,7 @@ def plainly(
                     claim["entries"] += 1
                     claim["existence"] += entry["existence"]
                     claim["with_object"] += about.role[i] != GHOST
-                if about.role[i] == GHOST and is_measured and not unknown:
+                if about.role[i] == role == GHOST and is_measured and not unknown:
                     by_run[s]["ghosts"] += 1
                     ghosts_at[s] += entry["existence"] >= np.array(settings.existence_thresholds)
                     for one in bands(s, k, place):

@@ -548,8 +548,8 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
         if "ViewBlueprint:display_name" in b.schema.names
     ]
     assert set(names) >= {
-        "PEM · whole run: 1 of 2 known, 0 false", "pole · whole run: 2 of 2 known, 0 false",
-        "none · whole run: 0 of 2 known, 0 false",
+        "PEM · whole run: 1 of 2 known", "pole · whole run: 2 of 2 known",
+        "none · whole run: 0 of 2 known",
         "7 car, onset 2.0 s", "What difference it made",
         "7 car: position error, m", "GOSPA of all measured objects, m", "Measured objects known (grey: there are)",
         "Events", "Legend",

@@ -353,7 +353,7 @@ def _add_entries(
             claim.entries += 1
             claim.existence += existence
             claim.with_object += about.role[i] != GHOST
-            if about.role[i] == GHOST:
+            if nowhere and about.role[i] == GHOST:
                 _add_false_positive(
                     s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, asked, targets, wanted, out
                 )

@@ -31,8 +31,8 @@ Over an episode, by matches now; an object that is never matched has the worst v
 
 Over all lists:
 
-- ghosts (1): about nobody at the instant they tell of, of measured classes. Each goes to the nearest object looked at,
-  if there is one. *Stale* entries are about somebody then, and at nobody now; they are no ghosts.
+- ghosts (1): about nobody, neither at the instant they tell of nor now, of measured classes. Each goes to the nearest
+  object looked at, if there is one. *Stale* entries are about somebody then, and at nobody now; they are no ghosts.
 - GOSPA (m, α = 2, cut-off c, power p): of what is looked at in a list against the entries that belong to it, and those
   at nobody now, stale or not; entries of what is not looked at now (an unmeasured object, the ego) are left out. Pairs
   are the best ones by distance, not those of the match. dᵖ, and cᵖ/2 of a miss, are the object's part, cᵖ/2 of a false

@@ -207,7 +207,8 @@ def _false_sections(study: ReportData) -> Iterator[_Section]:
         of_name = rows[rows["configuration"] == name]
         told.append(join_html([make_tag("b", name), f" {len(of_name)}: {describe_false_tracks(of_name)}"]))
     if len(rows):
-        words = f"Entries about nobody in run {shown.get(log, 0)} of {log}, the longest first. {FALSE_TRACKS}: all runs."
+        where = f"run {shown.get(log, 0)} of {log}"
+        words = f"Entries about nobody in {where}, the longest first. Those of all runs are in {FALSE_TRACKS}."
         yield _Section("false-tracks", "False tracks", [make_tag("p", words), make_list(told)])
 
 
