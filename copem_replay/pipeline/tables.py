@@ -4,7 +4,7 @@
 |---|---|
 | `accuracy` | as `detections`: position error and part of GOSPAᵖ by list of the stay, and as held by frame; ghosts |
 | `instants` | log × configuration, and run where runs differ in them: when lists are available, which are held |
-| `lists` | log × configuration × run: lists, ghosts, stale ones, and how many of the others from which existence on |
+| `lists` | log × configuration × run: lists, ghosts, stale entries, and how many ghosts from which existence on |
 | `false_tracks` | log × configuration × run × false track: when, where, how many entries, whose |
 | `needless` | log × configuration × run × time that the driver brakes for nothing: when, how long, by whose entry |
 | `thresholds` | log × configuration × run × object × step: when it is detected if more existence is asked for |

@@ -16,15 +16,15 @@
 | `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |
 | `lists/<place>_<configuration>/<unit>` | lost, late and overtaken lists of a unit that sends by a link |
 | `world/<configuration>/needless` | what the driver brakes for who brakes for nothing, while he does |
-| `world/<configuration>/false` | entries about no object: dashed outlines with a cross |
+| `world/<configuration>/false`, `second` | entries about nobody, crossed; second entries of somebody, thin |
 | `plots/visible_share/<object>/…` | visible share from the ego's units, and the best of all; `…_outside`: out of view |
 | `plots/visible_share/<object>/mark_1`, … | onset and detections on these curves |
 | `plots/position_error/<object>/<configuration>` | fused to true position: running quartiles |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
 | `legend/…` | the colour of each configuration |
-| `events/onsets`, `events/<configuration>`, `…/lists`, `…/needless` | texts: what happens when |
-| `difference`, `summary`, `words` | texts |
+| `events/onsets`, `events/<configuration>`, `…/lists`, `…/needless`, `…/false` | texts: what happens when |
+| `difference`, `summary`, `words`, `false` | texts; `false`: the longest false tracks |
 | `difference_short`, `helps/<object>` | what of the differences is in the overview; what would help with an object |
 
 `<object>` is for example `6_pedestrian`. More than seven configurations go into several files (`viewer/sink.py`).

@@ -71,6 +71,33 @@ def test_only_rows_that_count_are_compared(tmp_path):
     assert (time["n"], time["difference"]) == (2, pytest.approx(0.5))
 
 
+GNN_IS = {"ideal": "ideal", "ideal_of": "inputs"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "sign", "end"),
+    [
+        ({}, 1, None),
+        ({"gnn": GNN_IS}, 1, 0.0),
+        ({"ideal": {"truth": True}}, 1, 0.0),
+        ({"gnn": GNN_IS | {"ideal_of": "units"}}, 1, None),
+        ({"gnn": GNN_IS | {"recorded": True}}, 1, None),
+        ({"gnn": {"truth": True}}, -1, 0.0),
+        ({"gnn": {"truth": True}}, 1, None),
+    ],
+)
+def test_no_limit_is_where_the_difference_cannot_be(tmp_path, facts, sign, end):
+    """gnn knows one of five objects 2 s later, or sooner: 0.4 ± 2.776 · 0.4 s, by Student's t. It is no sooner than
+    ideal fusion of the same inputs, nor is this than the truth; whatever is found against that is left as it is.
+    """
+    late, soon = ([row(name, 1.0 if k else at, object_id=str(k)) for k in range(5)] for name, at in
+                  (("gnn" if sign > 0 else "ideal", 3.0), ("ideal" if sign > 0 else "gnn", 1.0)))  # fmt: skip
+    time = of(compared(tmp_path, late + soon, facts=facts), "ttd_rmst_s")
+    ends = sorted([sign * time["low"], sign * time["high"]])
+    assert time["difference"] == pytest.approx(sign * 0.4)
+    assert ends == pytest.approx([-0.4 * 1.77645 if end is None else end, 0.4 * 3.77645], abs=1e-4)
+
+
 def test_never_detected_counts_as_the_horizon(tmp_path):
     time = of(compared(tmp_path, THREE), "ttd_rmst_s")
     assert time["value"] == pytest.approx((1.5 + 10 + 10) / 3)

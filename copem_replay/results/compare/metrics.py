@@ -72,7 +72,7 @@ _FILES = ("lists.parquet", "thresholds.parquet")
 
 @dataclass(frozen=True)
 class GhostTotals:
-    """Ghosts of a configuration in all logs and runs, without stale ones; the existence at which it detects."""
+    """Ghosts of a configuration in all logs and runs; the existence at which it detects."""
 
     minutes: float
     existence: Float  # (T,) ascending
