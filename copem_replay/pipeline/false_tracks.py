@@ -14,7 +14,8 @@ import pandas as pd
 from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.object_list import Entries, ObjectLists, join_entries, take_entries
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Bool, Float, Int
-from copem_replay.metrics.accuracy.statistics import AccuracySettings, are_annotated
+from copem_replay.metrics.accuracy.aggregator import are_annotated
+from copem_replay.metrics.accuracy.statistics import AccuracySettings
 from copem_replay.metrics.episodes import Reference
 from copem_replay.metrics.matching import GHOST, Matches
 

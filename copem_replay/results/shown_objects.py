@@ -82,9 +82,8 @@ def measure_apart(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
     later_s = [after_s.sub(after_s[name], axis=0) - (usual_s - usual_s[name]).clip(lower=0.0) for name in after_s]
     episodes["apart_s"] = np.max([of.max(axis=1) for of in later_s], axis=0)
     episodes["apart_raw_s"] = after_s.max(axis=1) - after_s.min(axis=1)
-    end_s = np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S)
-    episodes["last_s"] = by_object["detection_s"].max().fillna(end_s)
-    return episodes
+    never_s = np.minimum(episodes["ended_s"], episodes["onset_s"] + UNKNOWN_S)
+    return episodes.assign(last_s=by_object["detection_s"].max().fillna(never_s))
 
 
 def select_differing_rows(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:

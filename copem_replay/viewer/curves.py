@@ -25,7 +25,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import AROUND_S, interpolate_at_instants, interpolate_states
 from copem_replay.core.tracks import SAME_INSTANT_NS, SAME_INSTANT_S, Bool, Float, Int, Tracks
 from copem_replay.experiment.schema import Experiment
-from copem_replay.metrics.accuracy.statistics import are_annotated
+from copem_replay.metrics.accuracy.aggregator import are_annotated
 from copem_replay.metrics.episodes import measured_objects
 from copem_replay.metrics.gospa import gospas_m
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from copem_replay.core.geometry import polygon_corners
+from copem_replay.core.geometry import are_in_area, polygon_corners
 from copem_replay.core.object_list import ObjectLists
-from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Scene, Tracks
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 from copem_replay.metrics.accuracy.kernel import (
     AccuracyParameters,
     AccuracySums,
@@ -149,3 +149,12 @@ def _time_s(issue_s: Float, present: Bool) -> float:
     """
     neighbours = present[1:] & present[:-1]
     return float(np.diff(issue_s)[neighbours].sum())
+
+
+def are_annotated(x_m: Float, y_m: Float, list_ix: Int, reference: Reference, settings: AccuracySettings) -> Bool:
+    """(N,) whether places in lists are in the annotated area; `reference`: at the instants of all lists."""
+    if not settings.annotated_m and np.isinf(settings.annotated_range_m):
+        return np.ones(len(list_ix), dtype=bool)
+    from_m, corners = (reference.x_m[list_ix], reference.y_m[list_ix]), polygon_corners(settings.annotated_m)
+    x_m, y_m = np.ascontiguousarray(x_m), np.ascontiguousarray(y_m)
+    return are_in_area(x_m, y_m, *from_m, corners, settings.annotated_range_m)

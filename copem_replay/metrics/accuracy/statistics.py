@@ -59,10 +59,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from copem_replay.core.geometry import are_in_area, polygon_corners
-from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.core.tracks import Int
 from copem_replay.metrics.accuracy.kernel import Records
-from copem_replay.metrics.episodes import Reference
 
 EXISTENCE_BINS = 10
 """Bins of equal width, as many as in Naeini et al. 2015."""
@@ -133,15 +131,6 @@ class AccuracySettings:
     existence_thresholds: tuple[float, ...] = ()
     annotated_m: tuple[tuple[float, float], ...] = ()  # corners of the annotated area; none: everywhere
     annotated_range_m: float = np.inf  # radius of the annotated area around the reference
-
-
-def are_annotated(x_m: Float, y_m: Float, list_ix: Int, reference: Reference, settings: AccuracySettings) -> Bool:
-    """(N,) whether places in lists are in the annotated area; `reference`: at the instants of all lists."""
-    if not settings.annotated_m and np.isinf(settings.annotated_range_m):
-        return np.ones(len(list_ix), dtype=bool)
-    from_m, corners = (reference.x_m[list_ix], reference.y_m[list_ix]), polygon_corners(settings.annotated_m)
-    x_m, y_m = np.ascontiguousarray(x_m), np.ascontiguousarray(y_m)
-    return are_in_area(x_m, y_m, *from_m, corners, settings.annotated_range_m)
 
 
 @dataclass(frozen=True)

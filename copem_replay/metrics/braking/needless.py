@@ -27,7 +27,8 @@ import numpy as np
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.object_list import Entries, ObjectLists, TellsOf, join_entries, take_entries, view_as_numbers
 from copem_replay.core.tracks import SAME_INSTANT_S, VALUES, Bool, Float, Int, Scene, Tracks
-from copem_replay.metrics.accuracy.statistics import AccuracySettings, are_annotated
+from copem_replay.metrics.accuracy.aggregator import are_annotated
+from copem_replay.metrics.accuracy.statistics import AccuracySettings
 from copem_replay.metrics.braking.demand import BrakingEgo
 from copem_replay.metrics.braking.driver import driver_deceleration
 from copem_replay.metrics.config import DUPLICATE_ENTRY, GHOST_ENTRY, LATE, MISPLACED, Confirm, Needless

@@ -563,11 +563,10 @@ def _limit_difference(
     if sign * difference < 0 or regret.metric not in _IN_TIME or not sign:
         return limits
     least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
-    found: dict[str, Any] = {name: limits[name] for name in _LIMITS if limits.get(name) is not None}
-    return limits | {name: min(max(limit, least), most) for name, limit in found.items()}
+    ends: dict[str, Any] = {name: limits.get(name) for name in ("low", "high", "low_bounded", "high_bounded")}
+    return limits | {name: min(max(end, least), most) for name, end in ends.items() if end is not None}
 
 
-_LIMITS = ("low", "high", "low_bounded", "high_bounded")
 _IN_TIME = ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s")
 """Metrics in which nothing is better than the truth, nor than ideal fusion of the same lists, row by row."""
 
