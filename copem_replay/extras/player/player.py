@@ -17,7 +17,7 @@ import pandas as pd
 
 from copem_replay.core.errors import CopemError
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene, Tracks
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, find_differing
@@ -25,6 +25,7 @@ from copem_replay.report.figures.style import sort_soonest_first
 from copem_replay.report.html.markup import Html, css_colour, join_html, make_tag
 from copem_replay.results.again import replay_again
 from copem_replay.results.shown_objects import choose_shown_objects
+from copem_replay.viewer.curves import find_false_rows
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.one_run import ReplayedRun
@@ -43,7 +44,7 @@ FULL_TURN = 32_768
 
 
 # Places, as the page holds them: 16-bit numbers. Tracks are pieces without a gap, each `object, first frame, frames`,
-# then `x, y, yaw` of every frame. Entries about no object are `frames`, then the number of each frame, then `x, y`.
+# then `x, y, yaw` of every frame. Entries about nobody are `frames`, then the number of each frame, then `x, y`.
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,12 @@ class Rows:
         return Rows(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def find_rows(tracks: Tracks, available_s: Float, instants_s: Float) -> Rows:
-    """The newest list of `tracks`, of one run, at each instant (K,). `available_s`: when each list is there, (F,)."""
+def find_rows(tracks: Tracks, available_s: Float, instants_s: Float, kept: Bool | None = None) -> Rows:
+    """The newest list of `tracks`, of one run, at each instant (K,). `available_s`: when each list is there, (F,).
+
+    `kept (P,)`: which rows are taken, None: all that are valid.
+    """
+    kept = tracks.valid[0] if kept is None else kept
     by_time = np.argsort(available_s, kind="stable")
     newest = np.searchsorted(available_s[by_time], instants_s + SAME_INSTANT_S, side="right") - 1
     frame = np.flatnonzero(newest >= 0)
@@ -90,7 +95,7 @@ def find_rows(tracks: Tracks, available_s: Float, instants_s: Float) -> Rows:
     count = bounds[lists + 1] - bounds[lists]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows, frame = order[np.repeat(bounds[lists], count) + within], np.repeat(frame, count)
-    rows, frame = rows[tracks.valid[0, rows]], frame[tracks.valid[0, rows]]
+    rows, frame = rows[kept[rows]], frame[kept[rows]]
     return Rows(frame, tracks.row_object_ix[rows], tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.yaw_rad[0, rows])
 
 
@@ -188,7 +193,7 @@ def _find_fused(replayed: ReplayedRun, instants_s: Float) -> dict[str, Rows]:
     found: dict[str, Rows] = {}
     for chunk in replayed.run_tracks:
         for name, fused_tracks in chunk.items():
-            rows, has_list = _find_in_chunk(fused_tracks, instants_s)
+            rows, has_list = _find_in_chunk(replayed, fused_tracks, instants_s)
             if name in found:
                 before = found[name].take(~has_list[found[name].frame])
                 pairs = ((getattr(before, column), getattr(rows, column)) for column in rows.__dataclass_fields__)
@@ -199,10 +204,14 @@ def _find_fused(replayed: ReplayedRun, instants_s: Float) -> dict[str, Rows]:
     return found
 
 
-def _find_in_chunk(fused_tracks: FusedTracks, instants_s: Float) -> tuple[Rows, Any]:
-    arrives_s = fused_tracks.fused.common_arrives_s
+def _find_in_chunk(replayed: ReplayedRun, fused_tracks: FusedTracks, instants_s: Float) -> tuple[Rows, Any]:
+    """Rows of objects and false entries, not second entries of somebody; whether there is a list by each instant."""
+    fused = fused_tracks.fused
+    arrives_s = fused.common_arrives_s
     has_list = arrives_s.min(initial=np.inf) <= instants_s + SAME_INSTANT_S
-    return find_rows(fused_tracks.fused, arrives_s, instants_s), has_list
+    kept = fused.valid[0] & (fused.row_object_ix >= 0)
+    kept |= find_false_rows(replayed.replay, replayed.experiment, fused_tracks)
+    return find_rows(fused, arrives_s, instants_s, kept), has_list
 
 
 def _fit_frames(tracks: dict[str, Rows], instants_s: Float) -> tuple[Grid, dict[str, Rows]]:
@@ -296,7 +305,7 @@ _KEYS = (
 _SIGNS = (
     ("known", "filled: known"),
     ("listed", "outline: listed, not yet known, from a list captured before the onset, or not measured"),
-    ("false", "dashed with ✕: about no object"),
+    ("false", "dashed with ✕: about nobody"),
     ("truth", "grey: where it really is"),
     ("ego", "grey, filled: the ego"),
     ("unit", "▲ a unit at the road"),
