@@ -114,7 +114,7 @@ def describe_false_tracks(rows: pd.DataFrame) -> str:
     """In words the false tracks of a configuration in one run, the longest first, `LISTED` at most; `none`."""
     ranked = rows.iloc[np.lexsort((rows["begins_s"], -rows["lasts_s"].round(6)))]  # rounding decides nothing
     told = [
-        f"{row.object_class} at ({row.x_m:.0f}, {row.y_m:.0f}) m from {row.begins_s:.1f} s on for {row.lasts_s:.1f} s"
+        f"{row.object_class} at ({row.x_m:.0f}, {row.y_m:.0f}) m from {row.begins_s:.1f} s on for {row.lasts_s:.2f} s"
         + ("" if pd.isna(row.units) else f", by {row.units}")
         for row in ranked[:LISTED].itertuples()
     ]

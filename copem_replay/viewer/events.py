@@ -257,7 +257,7 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - filled in colour: what is believed, where it is believed to be, paler the older it is (0 to 1 s); pale discs: 2σ of
   the position
 - dashed with a cross: false, about nobody; `false: 24 m ahead, 6 m left`: where, seen from the ego; thin outlines: a
-  second entry of somebody
+  second entry of somebody, or nobody of a class that is not measured
 - words below an object we look at: only its name, it is known; else why it is not: `58 behind car 41`;
   a sentence, when it is selected
 - red lines: from the unit that sees most of an object to what hides it

@@ -122,8 +122,8 @@ def test_in_words_the_longest_first_and_no_more_than_five() -> None:
     table = found(*rows, (0, 4, 30.0, 0.0))
     said = describe_false_tracks(table)
     assert said.split("; ")[:2] == [
-        "pedestrian at (30, 0) m from 0.3 s on for 0.2 s, by b",
-        "pedestrian at (0, 0) m from 0.0 s on for 0.1 s, by a",
+        "pedestrian at (30, 0) m from 0.3 s on for 0.20 s, by b",
+        "pedestrian at (0, 0) m from 0.0 s on for 0.10 s, by a",
     ]
     assert said.endswith("; and 2 more")
     assert said.count("pedestrian") == 5

@@ -205,7 +205,14 @@ def _false_sections(study: ReportData) -> Iterator[_Section]:
     told = []
     for name in study.contenders:
         of_name = rows[rows["configuration"] == name]
-        told.append(join_html([make_tag("b", name), f" {len(of_name)}: {describe_false_tracks(of_name)}"]))
+        told.append(
+            join_html(
+                [
+                    make_tag("b", name),
+                    f", {len(of_name)}: {describe_false_tracks(of_name)}" if len(of_name) else ": none",
+                ]
+            )
+        )
     if len(rows):
         where = f"run {shown.get(log, 0)} of {log}"
         words = f"Entries about nobody in {where}, the longest first. Those of all runs are in {FALSE_TRACKS}."
