@@ -549,7 +549,7 @@ class TestFiles:
         assert set(first) == {
             "detections.parquet", "exact.parquet", "experiment.yaml", "provenance.json", "summary.csv", "sweep.csv",
             "accuracy.parquet", "bands.csv", "instants.parquet", "lists.parquet", "thresholds.parquet", "tally.parquet",
-            "logs.csv", "read.csv",
+            "logs.csv", "read.csv", "false_tracks.parquet",
         }  # fmt: skip
         assert first == written(tmp_path / "b")
 

@@ -18,7 +18,7 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "e.yaml").write_text(changed("show: {run: 0}"))
     folder = cr.run(place / "e.yaml").save(place / "old")
     said = json.loads((folder / "provenance.json").read_text())
-    assert said.pop("format") == 5
+    assert said.pop("format") == 6
     (folder / "provenance.json").write_text(json.dumps(said))
     return folder
 

@@ -61,7 +61,8 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 SEALED = (
     "experiment.yaml", "detections.parquet", "tally.parquet", "summary.csv", "summary_by.csv", "exact.parquet",
-    "sweep.csv", "accuracy.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet", "bands.csv", "logs.csv",
+    "sweep.csv", "accuracy.parquet", "false_tracks.parquet", "instants.parquet", "lists.parquet", "thresholds.parquet",
+    "bands.csv", "logs.csv",
     "read.csv", "replay.mcap",
 )  # fmt: skip
 READERS: dict[str, tuple[str, ...]] = {

@@ -36,7 +36,7 @@ from tests.helpers.recordings import Obj, write_recording
 from tests.helpers.replays import save_run, study_rows
 from tests.helpers.scenes import experiment
 
-OF_ACCURACY = {*COMPARED_FILES, "bands.csv"}
+OF_ACCURACY = {*COMPARED_FILES, "bands.csv", "false_tracks.parquet"}
 
 
 def plan(**changes: Any) -> Experiment:

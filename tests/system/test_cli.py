@@ -502,9 +502,9 @@ class TestRun:
         assert ended.lines == []
         assert re.search(END, ended.out)
         assert sorted(written(here / "out" / "e")) == [
-            "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "instants.parquet",
-            "lists.parquet", "logs.csv", "provenance.json", "read.csv", "summary.csv", "tally.parquet",
-            "thresholds.parquet",
+            "accuracy.parquet", "bands.csv", "detections.parquet", "experiment.yaml", "false_tracks.parquet",
+            "instants.parquet", "lists.parquet", "logs.csv", "provenance.json", "read.csv", "summary.csv",
+            "tally.parquet", "thresholds.parquet",
         ]  # fmt: skip
         assert os.listdir(here / "out") == ["e"]
         assert set(table(here / "out" / "e")["configuration"]) == {"GT", "PEM", "coPEM"}
