@@ -22,6 +22,7 @@ KNOWN: dict[str, tuple[str, ...]] = {
     # versions; facts; seals
     "*provenance.json": ("copem_replay", "python", "libraries", "format", "configurations", "sha256"),
     "printed_*.txt": (r"note: (?:accuracy|replaying) took .*\n", r"\w+: \d+ (?:%,|of \d+ ).*\n"),  # where it took long
+    "*made.jsonl": ("*",),  # seals of .rrd
     "*.rrd": ("rerun.controls.RowId", "log_time", "copem_replay", "rerun_sdk"),  # when it was written, versions
 }
 """By file (as for fnmatch, below the compared folder) what may differ: all ("*"), keys, columns, patterns of text.

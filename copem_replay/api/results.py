@@ -145,8 +145,8 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
     `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
     interrupted (Ctrl-C).
 
-    Raises InputError: no such folder, no `replay.rrd` in it, or none of it with the object; OutputError where the
-    viewer does not open.
+    Raises InputError: no such folder, no `replay.rrd` in it, one that is damaged or of other results, or none of it
+    with the object; OutputError where the viewer does not open.
 
     >>> cr.view("out/nowhere")
     Traceback (most recent call last):
@@ -154,10 +154,12 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
     """
     from copem_replay.experiment.file import is_recording
     from copem_replay.results.provenance import check_format
+    from copem_replay.results.seals import check_recordings
     from copem_replay.viewer.open import Sought, list_rrd_files, opening_s
 
     folder = results.require_folder() if isinstance(results, Results) else Path(results)
     if folder.is_file() and folder.suffix == ".rrd" and object_id is None and log is None:
+        check_recordings([folder])
         files, folder = [folder.absolute()], folder.absolute().parent
         return _open_files(folder, files, opening_s(folder, files), web=web)
     if is_recording(folder):
@@ -178,6 +180,7 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
         if not files:
             where = "" if log is None else f" of log {log}"
             raise InputError(f"{folder}: no recording{where} has the measured object {object_id!r}")
+    check_recordings([folder / file.relative_to(folder.absolute()) for file in files])
     return _open_files(folder, files, instants_s, web=web)
 
 

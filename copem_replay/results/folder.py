@@ -93,18 +93,18 @@ def read_made(folder: Path) -> dict[str, str | None]:
     return made
 
 
-def add_to_made_list(folder: Path, files: Iterable[Path], seals: Mapping[str, str] | None = None) -> None:
+def add_to_made_list(folder: Path, files: Iterable[Path], seals: Mapping[Path, str] | None = None) -> None:
     """List those of `files` that lie in a results folder as made of its results, with which they go.
 
-    `seals`: by file name, of those that other commands read. To be called before a file gets its name, so that a killed
+    `seals`: of those that other commands read. To be called before a file gets its name, so that a killed
     process leaves no unlisted file. Raises OutputError.
     """
     root = os.path.realpath(folder)
     if not os.path.isfile(os.path.join(root, MARK)):
         return
-    places = [os.path.join(os.path.realpath(file.parent), file.name) for file in files]
-    names = sorted(os.path.relpath(place, root) for place in places if place.startswith(f"{root}{os.sep}"))
-    made, listed = [(name, (seals or {}).get(Path(name).name)) for name in names], read_made(folder).items()
+    places = {os.path.join(os.path.realpath(file.parent), file.name): (seals or {}).get(file) for file in files}
+    made = [(os.path.relpath(p, root), seal) for p, seal in sorted(places.items()) if p.startswith(f"{root}{os.sep}")]
+    listed = read_made(folder).items()
     if not (new := [name if seal is None else {name: seal} for name, seal in made if (name, seal) not in listed]):
         return
     cut_off = _read_made_list(folder)[-1:] not in (b"", b"\n")  # the last line, by a killed process

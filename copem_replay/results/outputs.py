@@ -166,5 +166,5 @@ def made_files(
     with atomic_files(folder, names, way_out=way_out) as scratch:
         yield scratch
         made = [name for name in names if (scratch / name).exists()]
-        seals = {name: digest_file(scratch / name) for name in made if sealed}
+        seals = {folder / name: digest_file(scratch / name) for name in made if sealed}
         add_to_made_list(results, [folder / name for name in made], seals)

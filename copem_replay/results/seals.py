@@ -1,9 +1,9 @@
 """Seals: `provenance.json` has the SHA-256 of every file of the results, and one of itself; readers check them.
 
-A file is read from end to end once for that, which takes less time than to decode it. Not sealed are recordings for
-Rerun, whose bytes are others in each writing: no command reads a figure from them. What commands made of the results
-for others to read has its seal in `made.jsonl`. A file that is gone is no damage here: who needs it says so. Results of
-older versions have no seals.
+A file is read from end to end once for that, which takes less time than to decode it. Recordings for Rerun, whose bytes
+are others in each writing, have their seals in `made.jsonl`, so that `provenance.json` is the same; so does what
+commands made of the results for others to read. A file that is gone is no damage here: who needs it says so. Results
+of older versions have no seals.
 """
 
 from __future__ import annotations
@@ -11,24 +11,44 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from copem_replay.core.errors import InputError
-from copem_replay.results.folder import MARK
+from copem_replay.results.folder import MADE, MARK, add_to_made_list, read_made
 from copem_replay.results.table_files import AGAIN
 
 SEALS = "sha256"
 """The key of `provenance.json` that has the seals, by the name of the file."""
-_UNSEALED = ".rrd"
+_OTHER_EACH_TIME = ".rrd"
+"""Files whose ids of rows and times of writing Rerun alone sets."""
 
 
 def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object]) -> dict[str, object]:
     """What `provenance.json` says, with the seals of the named files in a folder, and of itself. Raises OSError."""
-    seals = {name: digest_file(folder / name) for name in names if name != MARK and not name.endswith(_UNSEALED)}
+    seals = {name: digest_file(folder / name) for name in names if name != MARK and not name.endswith(_OTHER_EACH_TIME)}
     sealed = {**said, SEALS: seals}
     return {**sealed, SEALS: seals | {MARK: _digest_said(sealed)}}
+
+
+def seal_recordings(folder: Path, names: Iterable[str]) -> list[str]:
+    """Seal those of the named files in a folder whose bytes are others in each writing. Returns the list's name, if any.
+
+    Raises OutputError, OSError.
+    """
+    seals = {folder / name: digest_file(folder / name) for name in names if name.endswith(_OTHER_EACH_TIME)}
+    add_to_made_list(folder, seals, seals)
+    return [MADE] if seals else []
+
+
+def check_recordings(files: Sequence[Path]) -> None:
+    """Raise InputError where a sealed file of a results folder, in it or below, is not what was written."""
+    for file in files:
+        place = Path(os.path.realpath(file.parent)) / file.name
+        for folder in (parent for parent in place.parents if (parent / MARK).is_file()):
+            if seal := read_made(folder).get(place.relative_to(folder).as_posix()):
+                _check_digest(file, seal, AGAIN)
 
 
 def read_seals(said: Mapping[str, Any]) -> dict[str, str]:
@@ -52,17 +72,19 @@ def check_sealed(folder: Path, name: str, seals: Mapping[str, str | None], again
         out = f"give it another name, or {again}"
         raise InputError(f"{folder / name}: expected no such file among these results, found one; {out}")
     for one, seal in named.items():
-        try:
-            found = digest_file(folder / one)
-        except OSError as error:
-            raise InputError(
-                f"{folder / one}: expected a file of the results, found {error.strerror}; {again}"
-            ) from None
-        if found != seal:
-            raise InputError(
-                f"{folder / one}: expected the file that was written, SHA-256 {seal[:12]}…, "
-                f"found {found[:12]}…; put it back, or {again}"
-            )
+        _check_digest(folder / one, seal, again)
+
+
+def _check_digest(path: Path, seal: str, again: str) -> None:
+    try:
+        found = digest_file(path)
+    except OSError as error:
+        raise InputError(f"{path}: expected a file of the results, found {error.strerror}; {again}") from None
+    if found != seal:
+        raise InputError(
+            f"{path}: expected the file that was written, SHA-256 {seal[:12]}…, found {found[:12]}…; "
+            f"put it back, or {again}"
+        )
 
 
 def _digest_said(said: Mapping[str, object]) -> str:

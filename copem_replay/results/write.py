@@ -50,7 +50,7 @@ from copem_replay.pipeline.one_run import (
 from copem_replay.pipeline.run import StudyTables
 from copem_replay.pipeline.study_log import is_made
 from copem_replay.pipeline.sweep import list_points, resolve_sweep
-from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace, check_names
+from copem_replay.results.folder import EXPERIMENT, MADE, MARK, ResultsPlace, check_names
 from copem_replay.results.provenance import (
     build_provenance,
     escape_name,
@@ -59,7 +59,7 @@ from copem_replay.results.provenance import (
     recording_name,
     relative_path,
 )
-from copem_replay.results.seals import seal_results
+from copem_replay.results.seals import seal_recordings, seal_results
 from copem_replay.results.table_files import MANY_ROWS, TableFile, table_file, write_csv, write_parquet
 from copem_replay.results.truth_scene import draw_truth
 
@@ -154,13 +154,13 @@ def fill_place(
             raise RecordingError("cannot be opened: No such file or directory", path=first_recording(recording.place))
     files = list_results(study.experiment, study.recordings, exporters, _list_row_files(study))
     try:
-        place.scratch.may_remove(files)
+        place.scratch.may_remove([*files, MADE])
         _write_files(place.new, place.folder, study, skipped)
         notes = [*study.notes, *_export(place, study, exporters)]
         files = [name for name in files if name not in place.left_out]
         more = {"files": files} | ({"label": label} if label is not None else {})
         _write_provenance(place.new, build_provenance(study, skipped, notes) | more, files)
-        place.finish(files)
+        place.finish([*files, *seal_recordings(place.new, files)])
     except OSError as error:
         raise place.cannot_be_written(error) from error
     return notes

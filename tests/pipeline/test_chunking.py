@@ -429,7 +429,7 @@ def test_the_results_folder(
     assert "long" not in capsys.readouterr().err
     files = {path.name for path in (tmp_path / "whole").iterdir()}
     assert files == {path.name for path in (tmp_path / "pieces").iterdir()}
-    for name in files - {"replay.rrd"}:
+    for name in files - {"replay.rrd", "made.jsonl"}:
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "pieces" / name).read_bytes(), name
     whole, pieces = (shown_in(tmp_path / out / "replay.rrd") for out in ("whole", "pieces"))
     assert {"/world/gnn/status", "/world/ideal/listings"} <= whole.keys()

@@ -751,7 +751,7 @@ def test_the_run_that_is_shown_has_its_own_units(
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "read.csv",
         "summary.csv",
         "exact.parquet", "replay.mcap", "replay.rrd", "bands.csv", "lists.parquet", "thresholds.parquet",
-        "accuracy.parquet", "false_tracks.parquet", "instants.parquet",
+        "accuracy.parquet", "false_tracks.parquet", "instants.parquet", "made.jsonl",
     }  # fmt: skip
     # Lists of a run come when its own units send them: there are no instants that all runs have.
     assert "run" in pd.read_parquet(folder / "instants.parquet")

@@ -6,6 +6,7 @@ Who reads the recordings of results goes through their digest: replaced or gone,
 from __future__ import annotations
 
 import gc
+import hashlib
 import json
 import math
 import re
@@ -93,9 +94,11 @@ def said_by(call: Call, words: tuple[str, ...]) -> tuple[int, list[str], list[st
     return ended.code, ended.out, ended.lines, written
 
 
-def test_every_file_but_that_for_rerun_is_sealed_and_two_runs_have_the_same_seals(made: Path, tmp_path: Path) -> None:
+def test_every_file_is_sealed_and_two_runs_have_the_same_provenance(made: Path, tmp_path: Path) -> None:
     seals = read_provenance(made / "provenance.json").seals
     assert sorted(seals) == sorted(SEALED)
+    rerun = hashlib.sha256((made / "replay.rrd").read_bytes()).hexdigest()
+    assert (made / "made.jsonl").read_text().splitlines()[0] == f'{{"replay.rrd": "{rerun}"}}'
     assert {path.name for path in made.iterdir()} - {*SEALED} == {
         "provenance.json", "replay.rrd", "verdicts.jsonl", "made.jsonl",
     }  # fmt: skip
@@ -104,6 +107,27 @@ def test_every_file_but_that_for_rerun_is_sealed_and_two_runs_have_the_same_seal
         shutil.copy(made.parent / name, tmp_path)
     again = cr.run(tmp_path / "e.yaml", jobs=2).save(tmp_path / "out")
     assert (again / "provenance.json").read_bytes() == (made / "provenance.json").read_bytes()
+
+
+@pytest.mark.parametrize("asked", ["out", "out/replay.rrd"])
+def test_the_viewer_opens_the_recording_that_was_written_alone(
+    call: Call, folder: Path, asked: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = list[list[Path]]()
+    monkeypatch.setattr("copem_replay.viewer.open.open_viewer", lambda files, _: opened.append(files) or 0)
+    content = (folder / "replay.rrd").read_bytes()
+    for bit in places(folder / "replay.rrd", 5):
+        flip(folder / "replay.rrd", bit)
+        ended = call("view", asked)
+        assert (ended.code, len(ended.lines)) == (2, 1)
+        assert ended.lines[0].startswith("out/replay.rrd: expected the file that was written, SHA-256 ")
+        (folder / "replay.rrd").write_bytes(content)
+    assert opened == []
+    assert call("view", asked).code == 0
+    (folder / "replay.rrd").rename("elsewhere.rrd")  # a file of nobody's results has no seal
+    (folder / "mine.rrd").write_bytes(content)
+    assert [call("view", name).code for name in ("elsewhere.rrd", "out/mine.rrd")] == [0, 0]
+    assert [file.name for (file,) in opened] == ["replay.rrd", "elsewhere.rrd", "mine.rrd"]
 
 
 @pytest.mark.parametrize("reader", READERS)

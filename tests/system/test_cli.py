@@ -111,11 +111,11 @@ def installed(*arguments: str | Path, folder: Path, **more: Any) -> subprocess.C
 
 
 def written(folder: Path) -> dict[str, bytes]:
-    """All files of a folder, but for .rrd."""
+    """All files of a folder, but for .rrd, and their seals."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix != ".rrd"
+        if path.is_file() and path.suffix != ".rrd" and path.name != "made.jsonl"
     }
 
 
