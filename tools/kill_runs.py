@@ -136,11 +136,15 @@ class Trial:
         sys.addaudithook(hook)
 
     def files(self) -> Files:
-        """What is in the results folder, or the file that is written; of an .rrd that it is there."""
+        """What is in the results folder, or the file that is written; of an .rrd that it is there, without its seal."""
+        from copem_replay.results.folder import MADE
+
         if self.out.is_file():
             return {self.out.name: self.out.read_bytes()}
         paths = [path for path in sorted(self.out.rglob("*")) if path.is_file()]
-        return {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
+        files = {str(p.relative_to(self.out)): b"" if p.suffix == ".rrd" else p.read_bytes() for p in paths}
+        made = [line for line in files.pop(MADE, b"").splitlines(keepends=True) if b'.rrd"' not in line]
+        return files | ({MADE: b"".join(made)} if made else {})
 
     def add_files(self) -> None:
         """A file of the user's, and one that was made of the results, as `report` makes it."""

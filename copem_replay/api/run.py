@@ -29,7 +29,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.io.recording import Recording
-from copem_replay.pipeline.run import Progress
+from copem_replay.pipeline.run import Progress, StudyTables
 from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def run(
     else:
         workers = load_extra("workers", "executor")(crew, cache, progress)
         study = workers.read_study(lambda: make_study(experiment, recordings, LogSurvey(cache), workers))
-    return replay_study(study, prepare_study(study)[0], jobs, progress, cache)
+    return Results(study=replay_study(study, prepare_study(study)[0], jobs, progress, cache), exporters=list_exporters)
 
 
 SHOWN_AFTER_S = 2.0
@@ -120,14 +120,13 @@ def replay_study(
     jobs: int | None,
     progress: Progress | None,
     parts: PartCache | None = None,
-) -> Results:
+) -> StudyTables:
     """Replay the prepared logs of a study (`ready`). `progress(done, total)` is called after each block of runs."""
     from copem_replay.pipeline.run import run_experiment
 
-    tables = run_experiment(
+    return run_experiment(
         study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
     )
-    return Results(study=tables, exporters=list_exporters)
 
 
 def count_workers(jobs: int | None) -> int:

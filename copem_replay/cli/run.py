@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from copem_replay.api.study import LoadedStudy
     from copem_replay.experiment.file import ExperimentSource
     from copem_replay.experiment.schema import Experiment
+    from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.pipeline.parts import PartCache
+    from copem_replay.pipeline.run import StudyTables
     from copem_replay.results.decision import Decision
     from copem_replay.results.folder import ResultsPlace
     from copem_replay.results.read import Results
@@ -96,7 +98,7 @@ def run(
     For recordings the draft that `init` would print is replayed; it is experiment.yaml in the results folder.
     """
     from copem_replay.pipeline.parts import PartCache
-    from copem_replay.results.decision import describe_verdicts
+    from copem_replay.results.decision import decide, describe_verdicts
     from copem_replay.results.folder import EXPERIMENT, take_place
     from copem_replay.results.outputs import check_outputs
 
@@ -115,12 +117,13 @@ def run(
         cache = None if pieces is None else PartCache(pieces)
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
-        result, advice = _replay_study(study, jobs, cache, threads=cluster is None)
-        decision = _write_results(place, study, result, advice, cache, url, label)
-        _print_results(study.experiment, result, decision, explain=explain)
-        if by is not None and result.study is not None and result.study.summary_by is not None:
-            _print_groups(result.study.summary_by, split_entries(by) or ())
-        verdicts = _judge_results(place.shown, study.experiment)
+        tables, advice = _replay_study(study, jobs, cache, threads=cluster is None)
+        results = _write_results(place, study, tables, advice, cache, url, label)
+        decision = decide(results)
+        _print_results(tables, results, decision, explain=explain)
+        if by is not None and tables.summary_by is not None:
+            _print_groups(tables.summary_by, split_entries(by) or ())
+        verdicts = _judge_results(results)
         if report:
             from copem_replay.api.results import write_report
 
@@ -148,22 +151,21 @@ def _read_source(paths: Sequence[Path]) -> ExperimentSource:
     return read_experiment_text(Path(f"draft of {', '.join(map(str, paths))}"), text)
 
 
-def _judge_results(folder: Path, experiment: Experiment) -> Judgement | None:
+def _judge_results(results: Results) -> Judgement | None:
     """Judge the criteria of an experiment, write and print the verdicts; None: there are none. Those that are against
     results of before are left to `verdict`.
     """
-    if not experiment.criteria:
+    if not results.experiment.criteria:
         return None
     from copem_replay.results.judge import judge_own_criteria, list_later
-    from copem_replay.results.read import open_results
     from copem_replay.results.verdicts import FILE, write_verdicts
 
-    results = open_results(folder, "summary.csv", "tally.parquet")
     if later := list_later(results):
-        print_notes([f"criteria {', '.join(later)}: `copem-replay verdict {folder} --before FOLDER` judges them"])
+        command = f"copem-replay verdict {results.place} --before FOLDER"
+        print_notes([f"criteria {', '.join(later)}: `{command}` judges them"])
     if (verdicts := judge_own_criteria(results)) is None:
         return None
-    write_verdicts(verdicts, folder / FILE)
+    write_verdicts(verdicts, results.place / FILE)
     print_notes(verdicts.notes)
     print_line("")
     print_verdicts(verdicts)
@@ -194,65 +196,65 @@ def _read_study(
 
 def _replay_study(
     study: LoadedStudy, jobs: int | None, cache: PartCache | None, *, threads: bool
-) -> tuple[Results, list[str]]:
-    """Replay with progress on stderr. Returns the result and, if `threads` do the work, the advice on `--cluster`."""
+) -> tuple[StudyTables, list[str]]:
+    """Replay with progress on stderr. Returns what it gives and, where `threads` do it, the advice on `--cluster`."""
     from copem_replay.api.run import count_workers, replay_study
     from copem_replay.api.study import prepare_study
 
     replays, warnings = prepare_study(study)
     print_notes(warnings)
     began_s = time.perf_counter()
-    result = show_progress("replaying", lambda progress: replay_study(study, replays, jobs, progress, cache))
-    return result, advise_cluster(time.perf_counter() - began_s, count_workers(jobs)) if threads else []
+    tables = show_progress("replaying", lambda progress: replay_study(study, replays, jobs, progress, cache))
+    return tables, advise_cluster(time.perf_counter() - began_s, count_workers(jobs)) if threads else []
 
 
 def _write_results(
-    place: ResultsPlace, study: LoadedStudy, result: Results, advice: list[str], cache: PartCache | None,
+    place: ResultsPlace, study: LoadedStudy, tables: StudyTables, advice: list[str], cache: PartCache | None,
     viewer: str | None, label: str | None,
-) -> Decision:  # fmt: skip
-    """Fill the results folder, then print notes and problems. Returns what is decided."""
-    from copem_replay.results.decision import decide
+) -> Results:  # fmt: skip
+    """Fill the results folder, then print notes and problems. Returns the results."""
+    from copem_replay.api.run import list_exporters
+    from copem_replay.results.read import Results
+    from copem_replay.results.write import fill_place
 
-    notes = result.fill(place, skipped=study.skipped, viewer=viewer, label=label)
+    notes = fill_place(place, tables, exporters=list_exporters(viewer), skipped=study.skipped, label=label)
     if cache is not None:
         print_notes(sorted(cache.damaged))
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
-    assert result.study is not None
     print_notes([*place.notes, *skipped])
     print_first_notes(notes)
-    print_notes([*result.study.costs, *advice])
+    print_notes([*tables.costs, *advice])
     print_problems(place.failed)
-    return decide(result)
+    return Results(place.shown)
 
 
-def _print_results(experiment: Experiment, result: Results, decision: Decision, *, explain: bool) -> None:
+def _print_results(tables: StudyTables, results: Results, decision: Decision, *, explain: bool) -> None:
     """Print the summary: what fits a screen, or every figure and what it means."""
     from copem_replay.results.screen import format_screen
 
-    assert result.study is not None
-    summary = result.study.summary  # as it was computed: nine digits are on the edge of a rounding where it is not
+    summary = tables.summary  # as it was computed: nine digits are on the edge of a rounding where it is not
     if explain:
-        _print_summary(experiment, result, summary, decision)
+        _print_summary(results, summary, decision)
     else:
-        lines, marked = format_screen(result, summary, decision.best)
+        lines, marked = format_screen(results, summary, decision.best)
         print_rows(lines, marked)
-    if result.sweep is not None:
-        print_line(f"sweep of {', '.join(dict.fromkeys(result.sweep['sweep']))} in {result.place / 'sweep.csv'}")
+    if tables.sweep is not None:
+        print_line(f"sweep of {', '.join(dict.fromkeys(tables.sweep['sweep']))} in {results.place / 'sweep.csv'}")
 
 
-def _print_summary(experiment: Experiment, result: Results, summary: pd.DataFrame, decision: Decision) -> None:
+def _print_summary(results: Results, summary: pd.DataFrame, decision: Decision) -> None:
     """Print every figure of the summary, what it means, and what later commands hold the others against."""
     from copem_replay.core.tracks import TRUTH
     from copem_replay.metrics.summary import describe_began, format_summary
 
     print_table(format_summary(summary, width_of(sys.stdout)), decision.best)
-    configurations = experiment.configurations
-    if len(result.tally):
+    configurations = results.experiment.configurations
+    if len(results.tally):
         modelled = (name for name, one in configurations.items() if one.units != TRUTH)
-        reference, words = next(modelled, next(iter(configurations))), experiment.measure.began
-        print_line(describe_began(result.tally, reference, result.provenance.horizon_used_s, words))
-    _print_baseline(experiment)
+        reference, words = next(modelled, next(iter(configurations))), results.experiment.measure.began
+        print_line(describe_began(results.tally, reference, results.provenance.horizon_used_s, words))
+    _print_baseline(results.facts)
 
 
 def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:
@@ -264,13 +266,12 @@ def _print_groups(table: pd.DataFrame, entries: Sequence[str]) -> None:
     print(f"\n{groups_text(table[asked], width_of(sys.stdout))}\n")
 
 
-def _print_baseline(experiment: Experiment) -> None:
+def _print_baseline(facts: dict[str, ConfigurationFacts]) -> None:
     """Print which configuration `compare` and `report` hold the others against."""
-    from copem_replay.pipeline.expansion import find_facts
     from copem_replay.results.compare.labels import find_baseline
 
-    if len(names := list(experiment.configurations)) > 1:
-        baseline = find_baseline(find_facts(experiment), names)
+    if len(facts) > 1:
+        baseline = find_baseline(facts, list(facts))
         print_line(f"baseline of compare and report: {baseline.name}, {baseline.why}")
 
 

@@ -34,7 +34,7 @@ from copem_replay.experiment.file import (
     settings_places,
 )
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.open import File, Place
+from copem_replay.io.open import Place
 from copem_replay.io.recording import Recording
 from copem_replay.metrics.columns import COMPARED_FILES, TABLES
 from copem_replay.metrics.limits import find_clusters
@@ -64,7 +64,6 @@ if TYPE_CHECKING:
 
     from copem_replay.pipeline.expansion import ConfigurationFacts
     from copem_replay.pipeline.run import StudyTables
-    from copem_replay.results.folder import ResultsPlace
     from copem_replay.results.write import Exporter
 
 
@@ -94,8 +93,8 @@ class Results:
     """The results folder; None: they are not saved."""
     study: StudyTables | None = None
     """What was run, to be saved; None: they were read."""
-    exporters: Callable[[str | None], Sequence[Exporter]] | None = None
-    """How single runs are written, by the address of a Rerun viewer that also gets them; None: they are written."""
+    exporters: Callable[[str | None], Sequence[Exporter]] = lambda _: ()
+    """How single runs are written, by the address of a Rerun viewer that also gets them."""
 
     def __post_init__(self) -> None:
         self._called = self.folder or Path(f"run {next(_NUMBERS)}")
@@ -218,42 +217,23 @@ class Results:
         >>> result.save("out/example", overwrite=True).name
         'example'
         """
-        from copem_replay.results.write import check_own_files
+        from copem_replay.results.write import check_own_files, fill_place
 
-        study, exporters = self._require_study()
-        with take_place(Path(folder), overwrite=overwrite) as place:
-            check_inputs(place, [path for recording in study.recordings for path in recording.paths])
-            check_own_files(place, study.experiment, study.recordings, exporters(None))
-            self.fill(place)
-        if place.failed:
-            raise OutputError(place.failed)
-        return place.shown
-
-    def fill(
-        self, place: ResultsPlace, *, skipped: Sequence[tuple[File, str]] = (), viewer: str | None = None,
-        label: str | None = None,
-    ) -> list[str]:  # fmt: skip
-        """Write the results into a place that is locked. Returns notes, one line each.
-
-        `skipped`: logs that were left out, with reasons. `viewer`: address of a Rerun viewer that also gets the
-        recordings. `label`: what the results are called in a history. Raises InputError where the results were read
-        from a folder.
-        """
-        from copem_replay.results.write import fill_place
-
-        study, exporters = self._require_study()
-        notes = fill_place(place, study, exporters=exporters(viewer), skipped=skipped, label=label)
-        self.folder = place.shown
-        self._read_from(place.folder)
-        vars(self).pop("provenance", None)
-        return notes
-
-    def _require_study(self) -> tuple[StudyTables, Callable[[str | None], Sequence[Exporter]]]:
-        if self.study is None or self.exporters is None:
+        if (study := self.study) is None:
             raise InputError(
                 f"{self.place}: expected results of a run to save, found some that were read from a folder"
             )
-        return self.study, self.exporters
+        exporters = self.exporters(None)
+        with take_place(Path(folder), overwrite=overwrite) as place:
+            check_inputs(place, [path for recording in study.recordings for path in recording.paths])
+            check_own_files(place, study.experiment, study.recordings, exporters)
+            fill_place(place, study, exporters=exporters)
+            self.folder = place.shown
+            self._read_from(place.folder)
+            vars(self).pop("provenance", None)
+        if place.failed:
+            raise OutputError(place.failed)
+        return place.shown
 
     @cached_property
     def rows(self) -> LogRows:

@@ -33,7 +33,7 @@ def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object])
 
 
 def seal_recordings(folder: Path, names: Iterable[str]) -> list[str]:
-    """Seal those of the named files in a folder whose bytes are others in each writing. Returns the list's name, if any.
+    """Seal those of the named files in a folder whose bytes are others each time. Returns the name of the list, if any.
 
     Raises OutputError, OSError.
     """

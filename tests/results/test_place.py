@@ -83,8 +83,10 @@ class TestOthers:
             (here / "e.yaml").write_text(changed(f"show: {show}", "sweep: {latency_s: [0, 0.2]}"))
             drive(here / "b/drive.mcap")
             assert call("run", "e.yaml", "--log", "drive.mcap", "--log", "b/drive.mcap", "--overwrite").code == 0
-            names = sorted(p.relative_to(here / "out/e").as_posix() for p in (here / "out/e").rglob("*") if p.is_file())
-            assert json.loads((here / "out/e/provenance.json").read_text())["files"] == names
+            out = here / "out/e"
+            names = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+            assert json.loads((out / "provenance.json").read_text())["files"] == sorted(names - {"made.jsonl"})
+            assert belongings.read_made(out).keys() == {"made.jsonl"} | {one for one in names if one.endswith(".rrd")}
 
     @pytest.mark.parametrize("links", [True, False])
     def test_stays(self, old: Path, call: Call, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
