@@ -113,7 +113,8 @@ def fields(kind: type) -> str:
     if not dataclasses.is_dataclass(kind):
         return ""
     said = [f"`{field.name}: {field.type}`" for field in dataclasses.fields(kind)]
-    said += [f"`{name}`" for name, member in vars(kind).items() if is_property(member) and not name.startswith("_")]
+    members = [pair for of in kind.__mro__[::-1] if dataclasses.is_dataclass(of) for pair in vars(of).items()]
+    said += [f"`{name}`" for name, member in members if is_property(member) and not name.startswith("_")]
     return f"\nFields: {', '.join(said)}."
 
 

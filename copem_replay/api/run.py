@@ -125,7 +125,7 @@ def replay_study(
     from copem_replay.pipeline.run import run_experiment
 
     return run_experiment(
-        study.experiment, study.recordings, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
+        study.experiment, study.logs, jobs=count_workers(jobs), progress=progress, ready=ready, parts=parts
     )
 
 

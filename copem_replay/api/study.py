@@ -34,7 +34,7 @@ from copem_replay.experiment.validate import (
     take_lanes,
 )
 from copem_replay.io.open import File, Place, first_recording, list_recordings
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog, Recording
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.prepare import Replay
@@ -64,13 +64,18 @@ class SurveyingCrew(Protocol):
 
 @dataclass(frozen=True)
 class LoadedStudy:
-    """An experiment and the recordings it replays. `skipped`: logs that were left out, each with the reason."""
+    """An experiment and the logs it replays. `skipped`: logs that were left out, each with the reason."""
 
     source: ExperimentSource
     experiment: Experiment
-    recordings: tuple[Recording, ...]
+    logs: tuple[KnownLog, ...]
     skipped: tuple[tuple[File, str], ...] = ()
     survey: LogSurvey | None = None
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The logs whose content is in memory: all without a survey."""
+        return tuple(log for log in self.logs if isinstance(log, Recording))
 
 
 def load_experiment(experiment: AnyExperiment) -> Experiment:
@@ -247,10 +252,11 @@ def check_any_counted(study: LoadedStudy, replays: Sequence[Replay] = ()) -> Non
     `replays`: the prepared logs; of the others it is known from the survey.
     """
     from copem_replay.metrics.onset import check_counted
+    from copem_replay.pipeline.study_log import StoredLog
 
     numbers = [replay.episodes.count_began() for replay in replays]
-    surveys = [recording.survey for recording in study.recordings if recording.survey is not None]
-    numbers += [survey.said["facts"]["began"] for survey in surveys if "facts" in survey.said]
+    known = [log.said for log in study.logs if isinstance(log, StoredLog)]
+    numbers += [said["facts"]["began"] for said in known if "facts" in said]
     numbers += study.survey.began if study.survey is not None else []
     try:
         check_counted(numbers, study.experiment.measure.began)
@@ -267,9 +273,7 @@ def prepare_study(study: LoadedStudy) -> tuple[list[Replay], list[str]]:
     from copem_replay.pipeline.prepare import prepare_log
 
     replays = [
-        prepare_log(recording, resolve_for_log(study.experiment, recording.scene.log))
-        for recording in study.recordings
-        if recording.survey is None
+        prepare_log(recording, resolve_for_log(study.experiment, recording.scene.log)) for recording in study.recordings
     ]
     check_any_counted(study, replays)
     key: tuple[str, ...] = ("measure", "exact")

@@ -187,8 +187,8 @@ def _read_study(
 
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
-            check_inputs(place, [*given, *(path for recording in study.recordings for path in recording.paths)])
-            check_own_files(place, study.experiment, study.recordings, list_exporters())
+            check_inputs(place, [*given, *(path for log in study.logs for path in log.paths)])
+            check_own_files(place, study.experiment, study.logs, list_exporters())
             return study
 
         return read() if crew is None else crew.read_study(read)

@@ -56,7 +56,7 @@ from copem_replay.io.open import (
     sha256_of,
 )
 from copem_replay.io.recorded_units import read_recorded_output, read_recorded_unit
-from copem_replay.io.recording import Recording, find_middle, moving_ids, read_log
+from copem_replay.io.recording import KnownLog, Recording, find_middle, moving_ids, read_log
 from copem_replay.metrics.config import AREA, NO_AREAS, parse_slices
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
@@ -227,10 +227,10 @@ def log_names(paths: Sequence[File]) -> list[str]:
 class LogCache(Protocol):
     """A store of logs as they are read, each with the experiment resolved for it. `read` reads the log once more."""
 
-    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
-        """The recording as it was stored; None: it has to be read."""
+    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
+        """What is known of the log without reading it; None: it has to be read."""
 
-    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
+    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
         """The part of a recording that stays in memory. Raises RecordingError where its files have changed since."""
 
 
@@ -239,41 +239,41 @@ def read_logs(
     paths: Mapping[Place, Key | None] | Iterable[Place],
     source: ExperimentSource | None,
     survey: LogCache | None = None,
-) -> tuple[list[Recording], list[RefusedLog]]:
-    """The recordings that can be replayed, and the refused ones.
+) -> tuple[list[KnownLog], list[RefusedLog]]:
+    """The logs that can be replayed, without a `survey` all with their content, and the refused ones.
 
     `paths`: by place the key that names it, or the places alone. A file that is named twice is read once.
     """
     keys = paths if isinstance(paths, Mapping) else dict.fromkeys(paths)
-    recordings: dict[str, Recording] = {}
+    logs: dict[str, KnownLog] = {}
     refused: list[RefusedLog] = []
     names_by_place = _name_paths(source) if source is not None and isinstance(paths, Mapping) else {}
     settings_of = settings_by_place(experiment, source)
     for path, key in keys.items():
         if (missing := refuse_missing(path, key)) is not None:
             refused.append(missing)
-        elif (place := place_identity(path)) not in recordings:
+        elif (place := place_identity(path)) not in logs:
             entry, settings = settings_of.get(place, (None, None))
             alone = experiment if settings is None else apply_settings(experiment, settings)
             read, wrong = partial(_read_again, alone, path), list[RefusedLog]()
-            recording = None if survey is None else survey.known(path, alone, read)
-            if recording is None:
-                recording, wrong = _read_recording(alone, path)
+            known = None if survey is None else survey.known(path, alone, read)
+            if known is None:
+                known, wrong = recording, wrong = _read_recording(alone, path)
                 if recording is not None and not wrong and survey is not None:
-                    recording, wrong = _keep_recording(survey, recording, alone, read)
+                    known, wrong = _keep_recording(survey, recording, alone, read)
             refused += [log.within(entry, settings) for log in wrong]
-            if recording is not None and not wrong:
+            if known is not None and not wrong:
                 named = names_by_place.get(place, [])
                 notes = [f"named more than once ({', '.join(named)}): replayed once"] if len(named) > 1 else []
-                recordings[place] = replace(recording, notes=tuple(dict.fromkeys((*notes, *recording.notes))))
+                logs[place] = replace(known, notes=tuple(dict.fromkeys((*notes, *known.notes))))
     # Names are made unique among the logs that can be replayed: the experiment of the results lists only these.
     given = {place: settings.name for place, (_, settings) in settings_of.items() if settings.name is not None}
-    return _rename_recordings(recordings, given), refused
+    return _rename_logs(logs, given), refused
 
 
 def _keep_recording(
     survey: LogCache, recording: Recording, experiment: Experiment, again: Callable[[], Recording]
-) -> tuple[Recording | None, list[RefusedLog]]:
+) -> tuple[KnownLog | None, list[RefusedLog]]:
     """The part of a recording that stays in memory, or its refusals where its files have changed since."""
     try:
         return survey.kept(recording, experiment, again), []
@@ -303,12 +303,12 @@ def _read_again(experiment: Experiment, place: Place) -> Recording:
     return recording
 
 
-def _rename_recordings(recordings: Mapping[str, Recording], given: Mapping[str, str]) -> list[Recording]:
-    """The recordings, by place, as logs with the names that are `given`, or made from their files."""
-    unnamed = {place: recording for place, recording in recordings.items() if place not in given}
+def _rename_logs(logs: Mapping[str, KnownLog], given: Mapping[str, str]) -> list[KnownLog]:
+    """The logs, by place, with the names that are `given`, or made from their files."""
+    unnamed = {place: log for place, log in logs.items() if place not in given}
     names = dict(given)
-    names |= zip(unnamed, log_names([first_recording(recording.place) for recording in unnamed.values()]), strict=True)
-    return [replace(r, scene=replace(r.scene, log=names[place])) for place, r in recordings.items()]
+    names |= zip(unnamed, log_names([first_recording(log.place) for log in unnamed.values()]), strict=True)
+    return [replace(log, scene=replace(log.scene, log=names[place])) for place, log in logs.items()]
 
 
 def settings_by_place(experiment: Experiment, source: ExperimentSource | None) -> dict[str, tuple[int, LogSettings]]:
@@ -322,7 +322,7 @@ def settings_by_place(experiment: Experiment, source: ExperimentSource | None) -
     }
 
 
-def bind_logs(experiment: Experiment, recordings: Sequence[Recording], source: ExperimentSource | None) -> Experiment:
+def bind_logs(experiment: Experiment, recordings: Sequence[KnownLog], source: ExperimentSource | None) -> Experiment:
     """The experiment with an entry of `logs` per recording, named and with settings, where any log has settings."""
     settings_of = settings_by_place(experiment, source)
     if not settings_of and not uses_degrees(experiment):
@@ -464,7 +464,7 @@ def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[
 
 
 def check_across_logs(
-    experiment: Experiment, recordings: Sequence[Recording], source: ExperimentSource | None
+    experiment: Experiment, recordings: Sequence[KnownLog], source: ExperimentSource | None
 ) -> Iterator[str]:
     """Problems with all logs together: ids or units that no log has, names of shown logs that do not exist."""
 

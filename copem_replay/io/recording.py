@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,42 +55,19 @@ _NO_TRUTH = "lists of a unit they can be, not the truth"
 _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 
-@dataclass(frozen=True, repr=False)
-class Recording:
-    """A recording in memory: its scene, its ground truth, and notes on what was derived, corrected or skipped.
-
-    `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
-    the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.
-
-    >>> recording = cr.read_recording("logs/tc016d.mcap")
-    >>> recording.topic, recording.truth.units, recording.notes
-    ('ground_truth', ('truth',), ())
-    """
+@dataclass(frozen=True, kw_only=True, repr=False)
+class KnownLog:
+    """What is known of a log that was read, whether its content is in memory (`Recording`) or not."""
 
     scene: Scene
-    truth: Tracks
     path: Path
     topic: str
     notes: tuple[str, ...]  # a line per kind of thing derived, corrected, skipped or ignored
     host_id: str | None
-    damage: str | None = None  # what is wrong with the file and how far it could be read; it is among the notes, too
-    lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
-    around: LogContext | None = None  # frames of reference, where lists other than OSI's are read
-    encoding: str = "protobuf"  # of the messages of the truth
-    world: str = ""  # name of the frame of reference of the truth, "": none is named, as in OSI
-    window: Window | None = None  # the log time that was read; None: all
-    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
-    lanes: tuple[Lane, ...] = ()  # with a direction; those of maps, too
-    place_said: SaidPlace | None = None  # what it says of its place on earth
     together: DriveRecordings | None = None  # the recordings of the drive, `path` being the first; None: it is one
     remote: RemoteFile | None = None  # where it lies, if not on this machine: `path` was a copy
     sha256: str | None = None  # of the files that were read, where it is known already
     stamps: Stamps | None = None  # of its files on this machine before they were read; None: a copy, or not known
-    survey: StoredSurvey | None = None  # of a recording that was not read: no truth, no lists (`read_whole_recording`)
-
-    def __repr__(self) -> str:
-        objects, frames, lasts_s = len(self.scene.object_ids), len(self.truth.stamp_ns), self.scene.end_s
-        return f"Recording({self.path.name}, {self.topic}: {objects} objects, {frames} frames, {lasts_s:.1f} s)"
 
     @property
     def place(self) -> Place:
@@ -103,16 +80,44 @@ class Recording:
         return self.path if self.together is None else self.together
 
     @property
-    def object_states(self) -> int:
-        """Number of states in memory, of the truth and of all recorded lists."""
-        return sum(len(tracks.frame_ix) for tracks in (self.truth, *(unit.tracks for unit in self.lists.values())))
-
-    @property
     def paths(self) -> tuple[Path, ...]:
         """The files or folders on this machine that it is read from; none of a remote one."""
         if self.remote is not None:
             return ()
         return (self.path,) if self.together is None else self.together.paths
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Recording(KnownLog):
+    """A recording in memory: its scene, its ground truth, and notes on what was derived, corrected or skipped.
+
+    `truth` has the one unit TRUTH, one run, and arrives as it is captured. `host_id` is the host vehicle as
+    the log names it, whether or not there is such an object; `scene.ego_ix` is −1 where there is none.
+
+    >>> recording = cr.read_recording("logs/tc016d.mcap")
+    >>> recording.topic, recording.truth.units, recording.notes
+    ('ground_truth', ('truth',), ())
+    """
+
+    truth: Tracks
+    damage: str | None = None  # what is wrong with the file and how far it could be read; it is among the notes, too
+    lists: Mapping[str, RecordedLists] = field(default_factory=dict)  # of the recorded units, by their names
+    around: LogContext | None = None  # frames of reference, where lists other than OSI's are read
+    encoding: str = "protobuf"  # of the messages of the truth
+    world: str = ""  # name of the frame of reference of the truth, "": none is named, as in OSI
+    window: Window | None = None  # the log time that was read; None: all
+    lane_boundaries: tuple[Float, ...] = ()  # (K, 3) each, for showing only
+    lanes: tuple[Lane, ...] = ()  # with a direction; those of maps, too
+    place_said: SaidPlace | None = None  # what it says of its place on earth
+
+    def __repr__(self) -> str:
+        objects, frames, lasts_s = len(self.scene.object_ids), len(self.truth.stamp_ns), self.scene.end_s
+        return f"Recording({self.path.name}, {self.topic}: {objects} objects, {frames} frames, {lasts_s:.1f} s)"
+
+    @property
+    def object_states(self) -> int:
+        """Number of states in memory, of the truth and of all recorded lists."""
+        return sum(len(tracks.frame_ix) for tracks in (self.truth, *(unit.tracks for unit in self.lists.values())))
 
 
 def read_log(
@@ -204,7 +209,7 @@ def _read(
     all_notes = tuple(map(as_finding, notes))
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
-        scene, truth, log.path, topic, all_notes, host, damage,
+        scene=scene, truth=truth, path=log.path, topic=topic, notes=all_notes, host_id=host, damage=damage,
         around=around, encoding=encoding, world=world, window=log.window, lane_boundaries=columns.lane_boundaries,
         lanes=columns.lanes, place_said=columns.place, together=find_drive_recordings(log),
     )  # fmt: skip
@@ -480,22 +485,3 @@ def _describe_channels(channels: Sequence[Channel]) -> str:
     ]
     more = f", … ({count_noun(len(names), 'topic')} in all)" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more
-
-
-# A recording whose facts were stored by an earlier run: it is read again only where its objects are needed.
-
-
-@dataclass(frozen=True)
-class StoredSurvey:
-    """The stored facts (`said`), how to read the recording (`read`), and the key they were found by (`about`)."""
-
-    said: Mapping[str, Any]
-    read: Callable[[], Recording]
-    about: str = ""
-
-
-def read_whole_recording(recording: Recording) -> Recording:
-    """The recording with its truth and its lists: itself, or read now where it is only a survey."""
-    if recording.survey is None:
-        return recording
-    return replace(recording.survey.read(), scene=recording.scene, notes=recording.notes)

@@ -39,7 +39,7 @@ from copem_replay.experiment.drive import resolve_for_log, settings_notes
 from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.fusion.interface import IdealFusion
 from copem_replay.io.findings import as_finding
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
 from copem_replay.metrics.episodes import AGAIN_AFTER_S, measured_objects
 from copem_replay.metrics.metric import LinkTimes, OutputTimes, link_times
@@ -177,7 +177,7 @@ _SAMPLE = 16
 
 
 def list_notes(
-    recordings: Sequence[Recording], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
+    recordings: Sequence[KnownLog], ready: Sequence[Replay], experiment: Experiment, *, replayed: bool
 ) -> list[str]:
     """Notes on the recordings and on the experiment over them. `replayed`: whether conditions are known to be met."""
     odd = {
@@ -190,7 +190,7 @@ def list_notes(
 
 
 def study_notes(
-    recordings: Sequence[Recording], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
+    recordings: Sequence[KnownLog], oddities_of: Mapping[str, Iterable[str]], experiment: Experiment
 ) -> list[str]:
     """Notes on the recordings and on the experiment over them; `oddities_of`: the lines of `list_oddities` by log.
 
@@ -224,7 +224,7 @@ def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
     return lines
 
 
-def _find_empty_classes(recordings: Sequence[Recording], experiment: Experiment) -> Iterator[str]:
+def _find_empty_classes(recordings: Sequence[KnownLog], experiment: Experiment) -> Iterator[str]:
     """Measured classes that are named like their group and select nobody, though the group would: `vehicle`."""
     selects, others = Counter[str](), Counter[str]()  # by class, all logs together: the measured objects, and the rest
     asked: dict[str, None] = {}

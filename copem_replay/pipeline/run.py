@@ -26,7 +26,7 @@ from copem_replay.core.compiled import call_in_room
 from copem_replay.core.errors import OutputError, is_url
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.metrics.accuracy.statistics import AccuracyTotal, join_totals
 from copem_replay.metrics.config import parse_slices
 from copem_replay.metrics.detections_table import WAY
@@ -235,8 +235,8 @@ class StudyTables:
     _file: IO[bytes] | None = None
 
     @property
-    def recordings(self) -> tuple[Recording, ...]:
-        """The recording of each log."""
+    def recordings(self) -> tuple[KnownLog, ...]:
+        """The recording of each log, its content being in memory or not."""
         return tuple(log.recording for log in self.logs)
 
     @cached_property
@@ -334,7 +334,7 @@ class StudyTables:
 
 def run_experiment(
     experiment: Experiment,
-    recordings: Sequence[Recording],
+    recordings: Sequence[KnownLog],
     *,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -348,7 +348,7 @@ def run_experiment(
     """
     with watch_cost() as cost:
         if ready is None and parts is None:
-            read = [recording for recording in recordings if recording.survey is None]
+            read = [recording for recording in recordings if isinstance(recording, Recording)]
             ready = [prepare_log(recording, resolve_for_log(experiment, recording.scene.log)) for recording in read]
             check_closed_form(ready, experiment)
             memory_notes(ready, experiment)

@@ -6,17 +6,14 @@ The survey of a study's logs: each is read and checked before any run, and not a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-import numpy as np
-
 from copem_replay.core.components import Component
 from copem_replay.core.errors import ExperimentError, RecordingError, RemoteFile
-from copem_replay.core.tracks import TRUTH, VALUES, Tracks
 from copem_replay.experiment.drive import cache_last_experiment, resolve_for_log
 from copem_replay.experiment.maps import MapFile
 from copem_replay.experiment.schema import Experiment
@@ -31,7 +28,7 @@ from copem_replay.io.open import (
     read_file_stamps,
     sha256_of,
 )
-from copem_replay.io.recording import Recording, StoredSurvey, read_whole_recording
+from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.pipeline.notes import LogFacts, scene_as_json, scene_from_json
 from copem_replay.pipeline.parts import (
     PartCache,
@@ -50,11 +47,20 @@ Stamp = tuple[object, ...]
 _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
 
+@dataclass(frozen=True, kw_only=True, repr=False)
+class StoredLog(KnownLog):
+    """A log that is known by facts (`said`), its content being read where it is needed (`read`). `about`: their key."""
+
+    said: Mapping[str, Any]
+    read: Callable[[], Recording]
+    about: str = ""
+
+
 @dataclass
 class StudyLog:
     """A log of a study. `experiment`: the study's. `ready`: the log prepared for it; None: not yet, or dropped."""
 
-    recording: Recording
+    recording: KnownLog
     experiment: Experiment
     parts: PartCache | None = None
     ready: Replay | None = None
@@ -66,6 +72,11 @@ class StudyLog:
         """The name of the log."""
         return self.recording.scene.log
 
+    @property
+    def known(self) -> Mapping[str, Any] | None:
+        """The facts by which the log is known; None: its content is in memory."""
+        return self.recording.said if isinstance(self.recording, StoredLog) else None
+
     def replay(self) -> Replay:
         """The prepared log."""
         if self.ready is None:
@@ -74,19 +85,22 @@ class StudyLog:
 
     def whole(self) -> Recording:
         """The recording with its truth and its lists."""
+        log = self.recording
+        if isinstance(log, Recording):
+            return log
         if self._whole is None:
-            read = read_whole_recording(self.recording)
-            self._check_same(read)
+            assert isinstance(log, StoredLog)
+            read = replace(log.read(), scene=log.scene, notes=log.notes)
+            self._check_same(read, log.about)
             self._whole = read
         return self._whole
 
-    def _check_same(self, read: Recording) -> None:
+    def _check_same(self, read: Recording, about: str) -> None:
         """Raises RecordingError where the content differs from that of the kept facts, which are then removed."""
-        survey = self.recording.survey
-        if survey is None or (found := read_content_digest(read)) == self.digests["sha256"]:
+        if (found := read_content_digest(read)) == self.digests["sha256"]:
             return
-        if self.parts is not None and survey.about:
-            self.parts.forget(survey.about)
+        if self.parts is not None and about:
+            self.parts.forget(about)
         expected = self.digests["sha256"]
         raise RecordingError(
             f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {found[:12]}…; "
@@ -96,27 +110,25 @@ class StudyLog:
 
     def drop(self) -> None:
         """Drop from memory what can be read again; a recording that the survey holds stays."""
-        if self.recording.survey is not None:
+        if self.known is not None:
             self.ready = self._whole = None
 
     @cached_property
     def digests(self) -> Mapping[str, str]:
         """SHA-256 of the content, and of the truth."""
-        if self.recording.survey is not None:
-            return {name: self.recording.survey.said[name] for name in ("sha256", "truth")}
-        return compute_log_digests(self.recording)
+        if self.known is not None:
+            return {name: self.known[name] for name in ("sha256", "truth")}
+        return compute_log_digests(self.whole())
 
     @property
     def object_states(self) -> int:
         """Number of object states of the whole recording."""
-        survey = self.recording.survey
-        return self.recording.object_states if survey is None else int(survey.said["states"])
+        return self.whole().object_states if self.known is None else int(self.known["states"])
 
     @property
     def frames(self) -> int:
         """Number of lists of the truth."""
-        survey = self.recording.survey
-        return len(self.recording.truth.stamp_ns) if survey is None else int(survey.said["frames"])
+        return len(self.whole().truth.stamp_ns) if self.known is None else int(self.known["frames"])
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -135,10 +147,11 @@ class StudyLog:
     def _find_facts(self, alone: Experiment) -> LogFacts:
         if self.parts is None:
             return LogFacts.of(self.whole(), self.replay(), alone)
-        recording, survey = self.recording, self.recording.survey
+        recording = self.recording
         seen = None if recording.stamps is None else _drop_paths(recording.stamps)
         about = survey_key(recording.place, alone, seen)
-        kept = survey.said if survey is not None and survey.about == about else self.parts.known(about)
+        asked = isinstance(recording, StoredLog) and recording.about == about
+        kept = self.known if asked else self.parts.known(about)
         if kept is not None and kept["scene"]["log"] == self.name:
             return LogFacts.read(kept["facts"])
         replay = self.replay()
@@ -158,10 +171,10 @@ def compute_log_digests(recording: Recording) -> dict[str, Any]:
     return {"sha256": read_content_digest(recording), "truth": truth_digest(recording.scene, recording.truth)}
 
 
-def is_made(recording: Recording) -> bool:
-    """Whether a recording was made in memory, so that there is no file of it."""
-    known = recording.stamps is not None or recording.sha256 is not None or recording.survey is not None
-    return not known and isinstance(recording.local, Path) and not recording.local.exists()
+def is_made(log: KnownLog) -> bool:
+    """Whether a log is a recording that was made in memory, so that there is no file of it."""
+    read = log.stamps is not None or log.sha256 is not None or not isinstance(log, Recording)
+    return not read and isinstance(log.local, Path) and not log.local.exists()
 
 
 def read_content_digest(recording: Recording) -> str:
@@ -178,11 +191,11 @@ def read_content_digest(recording: Recording) -> str:
     return digest
 
 
-def drop_content(recording: Recording, read: Callable[[], Recording]) -> Recording:
-    """A recording without its truth and its lists, which `read` reads again where they are needed."""
+def drop_content(recording: Recording, read: Callable[[], Recording]) -> StoredLog:
+    """What is known of a recording without its content, which `read` reads again where it is needed."""
     said = {"states": recording.object_states, "frames": len(recording.truth.stamp_ns)}
-    survey = StoredSurvey(compute_log_digests(recording) | said, read)
-    return replace(recording, truth=_empty_tracks(), lists={}, around=None, lane_boundaries=(), lanes=(), survey=survey)
+    known = {one.name: getattr(recording, one.name) for one in fields(KnownLog)}
+    return StoredLog(**known, said=compute_log_digests(recording) | said, read=read)
 
 
 def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:
@@ -222,8 +235,8 @@ def _drop_paths(files: Stamps) -> list[Stamp]:
 
 def recall_log(
     parts: PartCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
-) -> Recording | None:
-    """A recording by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
+) -> StoredLog | None:
+    """A log by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
     try:
         about = survey_key(place, experiment)
     except RecordingError:  # reading the recording reports it
@@ -231,26 +244,18 @@ def recall_log(
     if (kept := parts.known(about)) is None:
         return None
     first = first_recording(place)
-    return Recording(
-        scene_from_json(kept["scene"]),
-        _empty_tracks(),
-        Path(first.name) if isinstance(first, RemoteFile) else first,
-        kept["topic"],
-        tuple(Finding(*note) if isinstance(note, list) else note for note in kept["notes"]),
-        kept["host"],
+    return StoredLog(
+        scene=scene_from_json(kept["scene"]),
+        path=Path(first.name) if isinstance(first, RemoteFile) else first,
+        topic=kept["topic"],
+        notes=tuple(Finding(*note) if isinstance(note, list) else note for note in kept["notes"]),
+        host_id=kept["host"],
         together=place if isinstance(place, DriveRecordings) else None,
         remote=place if isinstance(place, RemoteFile) else None,
-        survey=StoredSurvey(kept, read, about),
+        said=kept,
+        read=read,
+        about=about,
     )
-
-
-def _empty_tracks() -> Tracks:
-    """Tracks of no object."""
-    none, values = np.empty(0, dtype=np.int64), np.empty((1, 0))
-    return Tracks(
-        (TRUTH,), np.zeros(1, dtype=np.int64), none, none, none, none, np.empty(0), none, values,
-        np.empty((1, 0), dtype=bool), **dict.fromkeys(VALUES, values),
-    )  # fmt: skip
 
 
 # The survey of a study's logs.
@@ -273,11 +278,11 @@ class LogSurvey:
         self.problems: list[str] = []
         self._states = 0
 
-    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> Recording | None:
-        """A recording by the facts that are kept of it; None: it has to be read."""
+    def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
+        """A log by the facts that are kept of it; None: it has to be read."""
         return None if self.parts is None else recall_log(self.parts, place, experiment, read)
 
-    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> Recording:
+    def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
         """A recording that was read, in the experiment resolved for it: as it is, or without its truth and lists.
 
         Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.

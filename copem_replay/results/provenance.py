@@ -23,13 +23,13 @@ from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import read_logs, resolve_place
 from copem_replay.io.findings import Finding
 from copem_replay.io.open import File, Place, fetch_place, first_recording, read_file_stamps, sha256_of
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.metrics.columns import TABLES
 from copem_replay.metrics.config import Measure
 from copem_replay.pipeline.expansion import ConfigurationFacts, find_facts
 from copem_replay.pipeline.one_run import choose_logs, select_shown_runs
 from copem_replay.pipeline.run import StudyTables
-from copem_replay.pipeline.study_log import compute_log_digests, read_content_digest
+from copem_replay.pipeline.study_log import read_content_digest
 from copem_replay.results.folder import MARK
 from copem_replay.results.seals import read_seals
 from copem_replay.results.table_files import AGAIN
@@ -180,10 +180,12 @@ def reread_recording(log: RecordedLog, place: Place, experiment: Experiment) -> 
     recordings, refused = read_logs(experiment, [place], None)
     if refused:
         raise RecordingError([f"{refusal.path}: {refusal.reason}" for refusal in refused])
-    if recordings[0].stamps != stamps:  # a copy of its own, or it has changed since
-        log.check_same(read_content_digest(recordings[0]), first_recording(place))
+    (read,) = recordings
+    assert isinstance(read, Recording)
+    if read.stamps != stamps:  # a copy of its own, or it has changed since
+        log.check_same(read_content_digest(read), first_recording(place))
     # Draws are addressed by the log's name, which depends on what else was replayed.
-    return replace(recordings[0], scene=replace(recordings[0].scene, log=log.name))
+    return replace(read, scene=replace(read.scene, log=log.name))
 
 
 # What is written.
@@ -222,7 +224,7 @@ def build_provenance(
     }  # fmt: skip
 
 
-def list_read(recording: Recording) -> list[dict[str, object]]:
+def list_read(recording: KnownLog) -> list[dict[str, object]]:
     """What was left out or mended of a recording: how many, and the line that says what and why."""
     return [
         {"number": note.number, "what": str(note), "changes": note.changes}
@@ -236,7 +238,7 @@ def escape_name(name: str) -> str:
     return name.encode(errors="backslashreplace").decode()
 
 
-def log_entries(logs: Sequence[Any], recordings: Sequence[Recording], folder: Path) -> list[Any]:
+def log_entries(logs: Sequence[Any], recordings: Sequence[KnownLog], folder: Path) -> list[Any]:
     """`logs` of the folder's experiment: paths relative to the folder, with settings where logs have them."""
 
     def called(file: File) -> str:
@@ -269,8 +271,3 @@ def list_versions() -> dict[str, object]:
         "python": platform.python_version(),
         "libraries": {name: version(name) for name in _LIBRARIES},
     }
-
-
-def describe_logs(recordings: Sequence[Recording]) -> list[dict[str, object]]:
-    """Name, topic and content digests of each recording."""
-    return [{"log": r.scene.log, "topic": r.topic, **compute_log_digests(r)} for r in recordings]

@@ -35,7 +35,7 @@ from copem_replay.io.open import (
     read_file_stamps,
     sha256_of,
 )
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.metrics.columns import COMPARED_FILES, FALSE_TRACKS, NEEDLESS, TABLES
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.cost import return_memory
@@ -184,7 +184,7 @@ def make_scratch_results(study: StudyTables) -> Path:
 
 
 def check_own_files(
-    place: ResultsPlace, experiment: Experiment, recordings: Sequence[Recording], exporters: Sequence[Exporter]
+    place: ResultsPlace, experiment: Experiment, recordings: Sequence[KnownLog], exporters: Sequence[Exporter]
 ) -> None:
     """Raise OutputError where a file of the user's own has a name that the results will have."""
     if place.before is not None:
@@ -192,7 +192,7 @@ def check_own_files(
 
 
 def list_results(
-    experiment: Experiment, recordings: Sequence[Recording], exporters: Sequence[Exporter],
+    experiment: Experiment, recordings: Sequence[KnownLog], exporters: Sequence[Exporter],
     tables: Iterable[str] = ("detections.parquet", "tally.parquet"),
 ) -> list[str]:  # fmt: skip
     """The files that the results of an experiment have, by names relative to the folder.

@@ -57,16 +57,15 @@ LEAN = np.tan(EYE_RAD / 2 + ABOVE_RAD - np.pi / 2)
 class Camera:
     """Place and target of a camera, `(3,)` each, as seen from the entity `path`.
 
-    A camera that follows has a `path` that moves with object `object_ix`, `ahead_m` of it: a view with that origin
-    shows the same whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target
-    in the world, at the onset; `heading_rad`: what is up in the picture there. `aspect`: width by height of the view.
+    A camera that follows has a `path` that moves with object `object_ix`: a view with that origin shows the same
+    whenever it is first drawn. If `turns`, it turns with the object, too, and zooms. `at_m`: the target in the world,
+    at the onset; `heading_rad`: what is up in the picture there. `aspect`: width by height of the view.
     """
 
     place_m: Float
     target_m: Float
     at_m: Float
     object_ix: int | None = None
-    ahead_m: float = 0.0
     path: tuple[str, ...] = ("world",)
     turns: bool = False
     heading_rad: float = 0.0
@@ -92,7 +91,7 @@ def camera_on_ego(
         at_m = own[:3] + AHEAD_M * ahead
         path = (*EYES, "ego")
         up_rad = float(own[3]) + np.pi / 2
-        return Camera(np.round(place, 1), np.zeros(3), at_m, on, AHEAD_M, path, True, up_rad, aspect)
+        return Camera(np.round(place, 1), np.zeros(3), at_m, on, path, True, up_rad, aspect)
     units = [unit.at for unit in experiment.units.values() if unit.at is not None]
     ground_m = float(truth.z_m[0].mean()) if truth.z_m.size else 0.0
     place = np.array([*((*at[:2], ground_m) for at in units)]).reshape(-1, 3).T

@@ -80,7 +80,7 @@ def recording(things: Sequence[Thing], *, until_s: float, rate_hz: float = 10.0,
         moving=np.array([thing.moving for thing in things]),
         ego_ix=ids.index(ego) if ego in ids else -1,
     )
-    return Recording(scene, truth, Path("scene.mcap"), "truth", (), ego)
+    return Recording(scene=scene, truth=truth, path=Path("scene.mcap"), topic="truth", notes=(), host_id=ego)
 
 
 SEES_60_M = [{"when": {"range_m": [0, 60]}, "detection": {"kind": "constant", "probability": 1.0}}]

@@ -333,7 +333,9 @@ class TestCommand:
             for jobs in ("1", "2"):
                 options = ("--out", f"out/{jobs}", "--jobs", jobs, "--overwrite")
                 assert self.run(here, monkeypatch, *options, fusion=fusion, show="{run: 1}") == 0
-                files = [path for path in sorted((here / "out" / jobs).iterdir()) if path.suffix not in (".rrd", ".jsonl")]
+                files = [
+                    path for path in sorted((here / "out" / jobs).iterdir()) if path.suffix not in (".rrd", ".jsonl")
+                ]
                 written.append({path.name: path.read_bytes() for path in files})
             assert {"detections.parquet", "accuracy.parquet", "bands.csv", "replay.mcap"} < written[0].keys()
             assert written[0] == written[1]

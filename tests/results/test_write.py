@@ -66,7 +66,7 @@ def test_the_folder_of_several_logs(two_logs: list[Path], tmp_path: Path) -> Non
         "experiment.yaml", "provenance.json", "detections.parquet", "tally.parquet", "logs.csv", "read.csv",
         "summary.csv",
         "replay/near/drive.mcap", "replay/near/drive.rrd", "replay/far/drive.mcap", "replay/far/drive.rrd",
-        *OF_ACCURACY,
+        "made.jsonl", *OF_ACCURACY,
     }  # fmt: skip
     table = parquet.read_table(folder / "detections.parquet")
     assert table.column_names == list(TABLES["detections.parquet"].kinds("accuracy"))

@@ -29,7 +29,7 @@ from copem_replay.experiment.file import ExperimentSource, place_identity, reloc
 from copem_replay.experiment.schema import Experiment, LogSettings
 from copem_replay.experiment.validate import RefusedLog, log_names, read_logs, refuse_missing, settings_by_place
 from copem_replay.io.open import Place, first_recording
-from copem_replay.io.recording import Recording
+from copem_replay.io.recording import KnownLog
 from copem_replay.pipeline.closed_form import check_exact
 from copem_replay.pipeline.cost import RunCost, peak_bytes
 from copem_replay.pipeline.parts import (
@@ -210,7 +210,7 @@ class Crew:
     def read_study(self, read: Callable[[], LoadedStudy]) -> LoadedStudy:
         """The study that `read` returns, with all parts computed; it is read again after a log that killed workers."""
         check_any_counted(study := read())
-        while self.fill(study.experiment, study.recordings):
+        while self.fill(study.experiment, study.logs):
             study = read()
         return study
 
@@ -271,7 +271,7 @@ class Crew:
                 surveys[whose] = self._make_task(experiment, names[whose], place, settings)
         return surveys
 
-    def fill(self, experiment: Experiment, recordings: Sequence[Recording]) -> bool:
+    def fill(self, experiment: Experiment, recordings: Sequence[KnownLog]) -> bool:
         """Have workers compute all missing parts. Returns whether workers died of logs, which the study leaves out.
 
         Raises CopemError for what is wrong with the workers.

@@ -28,11 +28,12 @@ from copem_replay.extras.fitting.fit import (
 from copem_replay.extras.fitting.gather import Gathered
 from copem_replay.extras.fitting.rows import FitLists, FitRows
 from copem_replay.io.recording import Recording
+from copem_replay.pipeline.study_log import compute_log_digests
 from copem_replay.report.figures.style import format_three_digits
 from copem_replay.report.html.markup import Html, allow_breaks, join_html, make_list, make_table, make_tag
 from copem_replay.report.html.page import figure_element, section_links, whole_page
 from copem_replay.results.folder import EXPERIMENT, MARK, ResultsPlace
-from copem_replay.results.provenance import describe_logs, list_versions, log_entries
+from copem_replay.results.provenance import list_versions, log_entries
 from copem_replay.results.table_files import write_parquet
 from copem_replay.viewer.sink import (
     ELAPSED,
@@ -204,7 +205,7 @@ def fill_fit(place: ResultsPlace, fit: Fit, experiment: Experiment, recordings: 
     provenance = list_versions() | {
         "format": "fit",
         "unit": fit.unit,
-        "logs": describe_logs(recordings),
+        "logs": [{"log": r.scene.log, "topic": r.topic, **compute_log_digests(r)} for r in recordings],
         "notes": list(fit.said),
     }
     try:

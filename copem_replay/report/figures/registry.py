@@ -39,8 +39,8 @@ def _nothing_missing(results: Results, selection: Selection) -> str | None:
 class FigureKind:
     """A figure. `title`: its heading in the report. `shows`: what it shows, for readers who cannot see it.
 
-    `draw` makes it (`new_figure` within `figure_style()`); with `needs_recording` it raises RecordingError if the
-    recording is missing. `missing`: the reason why the results have no such figure, "" for a reason that need not be
+    `draw` makes it (`new_figure` within `figure_style()`); where it needs a recording that is missing, it raises
+    RecordingError. `missing`: the reason why the results have no such figure, "" for a reason that need not be
     given, None if they have one. `about`: paragraphs above it in the report.
     """
 
@@ -49,7 +49,6 @@ class FigureKind:
     draw: Callable[[Results, Selection], Figure]
     missing: Callable[[Results, Selection], str | None] = _nothing_missing
     about: Callable[[Results], Sequence[str]] = lambda results: ()
-    needs_recording: bool = False
 
 
 def _draw_runs(results: Results, of: Selection) -> Figure:
@@ -108,7 +107,6 @@ FIGURES: dict[str, FigureKind] = {
         "Single runs",
         "speed of the ego, distance and visible share of one object in one run, a column per configuration",
         _draw_runs,
-        needs_recording=True,
     ),
     "curves": FigureKind(
         "How soon",
@@ -126,7 +124,6 @@ FIGURES: dict[str, FigureKind] = {
         "the path of every measured object, coloured by how long it stays unknown, a panel per configuration",
         late_paths_figure,
         missing=lambda results, of: no_late_paths(results, results.chosen(of.configurations)),
-        needs_recording=True,
     ),
     "distances": FigureKind(
         "How far away",
