@@ -459,11 +459,12 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
     elif not count_counted(numbers := episodes.count_began(), measure.began):
         yield f"no object counts: {describe_numbers(numbers)}; `measure.began` has {', '.join(measure.began)}"
     yield from _find_returns(replay)
-    if experiment.braking is not None and len(episodes.object_ix) and not replay.encounters:
-        recorded = experiment.braking.ego == "recorded"
+    braking = experiment.braking if replay.scene.ego_ix >= 0 else None
+    if braking is not None and len(episodes.object_ix) and not replay.encounters:
+        recorded = braking.ego == "recorded"
         yield (
             f"no verdict: without braking ({'as recorded' if recorded else 'at constant speed'}) the ego stays "
-            f"more than {experiment.braking.margin_m:g} m from all measured objects"
+            f"more than {braking.margin_m:g} m from all measured objects"
             + ("; `ego: constant_speed` assumes that it had not braked" if recorded else "")
         )
 

@@ -32,6 +32,7 @@ from copem_replay.core.tracks import (
     class_indices,
     join_tracks,
 )
+from copem_replay.experiment.cross_references import NO_EGO
 from copem_replay.experiment.schema import Experiment
 from copem_replay.fusion.interface import IdealFusion, ListFusion
 from copem_replay.io.recorded_units import RecordedUnits, join_recorded_units
@@ -207,7 +208,7 @@ class Replay:
     def truth_demand(self) -> TruthDemand | None:
         """When the truth gives the driver a reason to brake; None: it is not asked whether lists do without one."""
         braking, needless = self.expanded.braking, self.expanded.needless
-        if braking is None or needless is None:
+        if braking is None or needless is None or self.scene.ego_ix < 0:
             return None
         ego = BrakingEgo(self.ego, braking.driver, needless.slower_mps)
         return find_truth_demand(ego, needless, self.scene, self.truth, self.expanded.max_gap_s)
@@ -380,8 +381,12 @@ def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Expe
     """
     scene = recording.scene
     if scene.ego_ix < 0:
-        for key, asked in (("braking", experiment.braking), ("measure.conflict", experiment.measure.conflict)):
-            if asked is not None:
+        driven = experiment.ego != NO_EGO  # a log that says it has none lacks verdicts, and no other log does
+        for key, asked in (
+            ("braking", driven and experiment.braking),
+            ("measure.conflict", experiment.measure.conflict),
+        ):
+            if asked:
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
     expanded = expand_experiment(experiment, scene)
     truth = interpolate_at_instants(

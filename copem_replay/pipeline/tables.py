@@ -241,7 +241,8 @@ def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experime
         frame = build_frame({n: values[rows[order]] for n, values in columns.items() if n not in without})
         part = PartTables(log, name, tabulate_rows(frame))
         if experiment.measure.accuracy:
-            beside, runs = _build_beside(outcomes, name).take(pa.array(order)), _build_runs(outcomes, name)
+            beside = _build_beside(outcomes, name).take(pa.array(order))
+            runs = _build_runs(outcomes, name, experiment.needless is not None)
             accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda one: one[0])]
             false = _tabulate_false_tracks(outcomes, name)
             part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies), false_tracks=false)
@@ -315,14 +316,15 @@ def _count_steps(scores: ConfigurationScores, runs: int) -> tuple[Int, Float, Fl
     return np.tile(count, times), np.tile(steps.existence[order], times), np.tile(steps.detection_s[order], times)
 
 
-def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
-    """`PartTables.runs` of a configuration, in the order of runs."""
+def _build_runs(outcomes: Sequence[BlockOutcome], name: str, needless: bool) -> pa.Table:
+    """`PartTables.runs` of a configuration, in the order of runs. `needless`: with the columns of needless braking."""
     rows: list[dict[str, Any]] = []
     for outcome in outcomes:
         scores = outcome.all_scores[name]
         accuracy, held = scores.accuracy, scores.held
         assert accuracy is not None
         assert held is not None
+        existence = list(accuracy.settings.existence_thresholds)
         instants: dict[str, Any] = {"available_s": scores.issue_s, "frame_s": held.frame_s}
         instants["held_list"] = [k if k >= 0 else None for k in held.list_ix.tolist()]
         for s, run in enumerate(outcome.runs.tolist()):
@@ -337,10 +339,10 @@ def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
                     "ghosts": int(sums["ghosts"]),
                     "stale_ghosts": int(sums["stale_ghosts"]),
                     "duplicates": int(sums["duplicates"]),
-                    "existence": list(accuracy.settings.existence_thresholds),
+                    "existence": existence,
                     "ghosts_at": accuracy.ghosts_at[s].tolist(),
                     "without_truth": int(held.without_truth[s]),
-                    **_driving_columns(scores.needless, s),
+                    **(_driving_columns(scores.needless, s, len(existence)) if needless else {}),
                     **instants,
                 }
             )
@@ -354,10 +356,10 @@ def _build_runs(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
     return pa.Table.from_pylist(rows, _RUNS)
 
 
-def _driving_columns(needless: NeedlessBraking | None, s: int) -> dict[str, Any]:
-    """The columns of `lists.parquet` about needless braking in one run."""
+def _driving_columns(needless: NeedlessBraking | None, s: int, levels: int) -> dict[str, Any]:
+    """The columns of `lists.parquet` about needless braking in one run; 0 where there is no ego to drive."""
     if needless is None:
-        return {}
+        return dict(zip(_DRIVING, (0.0, 0, 0.0, [0.0] * levels, 0.0, 0.0, 0.0), strict=True))
     values = (
         needless.driving_s, int(needless.brakes[s]), float(needless.needless_s[s]), needless.needless_s_at[s].tolist(),
         float(needless.speed_lost_mps[s]), needless.must_brake_s, float(needless.missed_s[s]),
@@ -367,10 +369,10 @@ def _driving_columns(needless: NeedlessBraking | None, s: int) -> dict[str, Any]
 
 def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
     """`PartTables.needless` of a configuration, by run and begin."""
-    parts = []
+    parts = [_EVENTS.empty_table()]
     for outcome in outcomes:
-        found = outcome.all_scores[name].needless
-        assert found is not None
+        if (found := outcome.all_scores[name].needless) is None:  # the log has no ego
+            continue
         columns = {
             "run": outcome.runs[found.run_ix],
             "begins_s": found.begins_s,

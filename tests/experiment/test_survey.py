@@ -109,26 +109,21 @@ def test_survey(path):
                         "delay_interval_s": None,
                         "delay": "cannot be told: nothing in them can be followed from list to list",
                         "oddities": [],
+                        "middle_m": [0.0, 0.0],
                     }
                 ],
                 "suggested": {
                     "ego": None,
                     "ego_why": "the log names its host vehicle: 4 (car)",
                     "classes": ["vru"],
-                    "onset": "in_range",
+                    "few": {},
+                    "range_m": 40.0,
+                    "again_after_s": None,
+                    "began": {"crossed": 0, "appeared": 0, "log_start": 1},
                     "masts": [
                         {"at": [40.0, 0.0], "yaw_deg": 180},
                         {"at": [20.0, 0.0], "yaw_deg": 0},
                     ],
-                    "masts_of_all": [
-                        {"at": [40.0, 0.0], "yaw_deg": 180},
-                        {"at": [20.0, 0.0], "yaw_deg": 0},
-                    ],
-                    "began": {
-                        "all": {"crossed": 0, "appeared": 0, "log_start": 1},
-                        "vru": {"crossed": 0, "appeared": 0, "log_start": 1},
-                        "vehicles": {"crossed": 0, "appeared": 0, "log_start": 0},
-                    },
                 },
             }
         ],

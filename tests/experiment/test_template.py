@@ -141,7 +141,7 @@ def test_the_longest_gap_is_that_of_the_recording(
 
 def test_the_mast_stands_beside_whom_it_looks_at(tmp_path: Path) -> None:
     """Pedestrian 7 is at (30, 6), all drive along y = 0 and −4: 10 m to his north-east nobody else is nearer."""
-    write_recording(tmp_path / "log.mcap", street(), host=1)
+    write_recording(tmp_path / "log.mcap", street(walkers=5), host=1)
     (truth,) = survey_recording(tmp_path / "log.mcap").truth
     first, second = truth.suggested.masts
     assert first == Mast(at=[37.1, 13.1], yaw_deg=-135)
@@ -231,7 +231,7 @@ def test_of_several_truths_the_fullest_and_the_others_are_named(tmp_path: Path, 
     assert "# read: {topic: truth}   # could be it, too" in format_draft(survey_recording("log.mcap"))
 
 
-def unit(name: str, *, covariance: bool = False, captured: bool = False) -> Topic:
+def unit(name: str, *, covariance: bool = False, captured: bool = False, velocity: bool = False) -> Topic:
     """Pedestrian 7 as a unit lists him, ten times a second."""
     messages = []
     for k in range(41):
@@ -243,6 +243,8 @@ def unit(name: str, *, covariance: bool = False, captured: bool = False) -> Topi
         item.header.tracking_id.value = 1
         item.base.position.x, item.base.position.y = 30.2, 6.1
         item.base.dimension.length = item.base.dimension.width = 0.6
+        if velocity:
+            item.base.velocity.x = item.base.velocity.y = 0.0
         if covariance:
             item.base_rmse.position.x = item.base_rmse.position.y = 0.3
         messages.append((ns(k / 10), data.SerializeToString()))
@@ -266,12 +268,46 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
         "front": {"topic": "/obu/front objects"},
         "ego_recorded": {"topic": "ego/objects"},
     }
-    assert experiment["configurations"]["recorded"]["units"] == ["rsu", "front", "ego_recorded"]
-    assert "with ego_recorded" not in experiment["configurations"]
-    assert experiment["configurations"]["with rsu"] == {"units": ["ego", "rsu"], "fusion": {"kind": "gnn"}}
+    assert list(experiment["units"]) == list(recorded), "no modelled ego or mast beside what is recorded"
+    units = {name: made["units"] for name, made in experiment["configurations"].items() if name != "GT"}
+    every = ["rsu", "front", "ego_recorded"]
+    assert units == {
+        "ideal": every, "gnn": every, "alone": ["ego_recorded"], "rsu": ["rsu"], "front": ["front"],
+        "recorded": ["rsu", "front"], "late": every,
+    }  # fmt: skip
     draft = format_draft(survey_recording("log.mcap"))
     assert "  # broken cannot be a unit: " in draft
-    assert draft.count("    # at: [0.0, 0.0]   # where is it? ") == 3, "of each recorded unit"
+    assert draft.count("    # at: [35.0, 5.0]   # where is it? ") == 3, "of each recorded unit"
+
+
+def test_a_recorded_roadside_unit_is_asked_as_it_is(tmp_path: Path, replayed: Callable[..., Any]) -> None:
+    """A car alone swings 70 m to both sides of the unit, whose middle is (35, 5): within 40 m of it around 10, 30, 50 and
+    70 s, and away for 12 s in between. It counts four times, from the unit, which is held against its own ideal.
+    """
+    frames = [(k / 5, [Obj(id=1, x=35 + 70 * np.cos(np.pi * k / 100), y=5.0)]) for k in range(401)]
+    write_recording(tmp_path / "log.mcap", frames, more=[unit("mcity.RSU.SensorData")])
+    experiment = replayed("log.mcap")
+    assert {name: made["at"] for name, made in experiment["units"].items()} == {"rsu": [35.0, 5.0]}
+    units = {name: made["units"] for name, made in experiment["configurations"].items()}
+    assert units == {"GT": "truth", "ideal": ["rsu"], "rsu": ["rsu"], "late": ["rsu"]}
+    measure = experiment["measure"]
+    assert measure["distance_to"] == "rsu"
+    assert measure["onset"] == {"kind": "in_range", "range_m": 40, "again_after_s": 10}
+    assert "only 4 crossed, 0 appeared, 0 log_start" in format_draft(survey_recording("log.mcap"))
+    known = cr.load_results("out/begun").known
+    assert known[(known["configuration"] == "rsu") & (known["run"] == 0)]["began"].tolist() == ["crossed"] * 4
+
+
+@pytest.mark.parametrize(("away_m", "onset"), [(30, 40), (60, 80), (100, 160), (170, None)])
+def test_the_radius_is_the_first_at_which_anything_counts(
+    tmp_path: Path, replayed: Callable[..., Any], away_m: float, onset: float | None
+) -> None:
+    """A pedestrian follows the ego at a distance; in the last frame alone he is at 5 m, from which nothing follows."""
+    frames = [(k / 10, [Obj(id=1, x=k, vx=10), pedestrian(7, k + away_m if k < 20 else 25)]) for k in range(21)]
+    write_recording(tmp_path / "log.mcap", frames, host=1)
+    expected = {"kind": "appears"} if onset is None else {"kind": "in_range", "range_m": onset}
+    assert replayed("log.mcap")["measure"]["onset"] == expected
+    assert len(set(cr.load_results("out/begun").known["object_id"])) == 1
 
 
 def test_topics_without_a_name(tmp_path: Path, replayed: Callable[..., Any]) -> None:
@@ -289,8 +325,7 @@ def test_what_a_stack_made_of_lists_is_no_unit_beside_them(tmp_path: Path, repla
     output = unit("/fusion/objects", covariance=True, captured=True)
     write_recording(tmp_path / "log.mcap", street(), host=1, more=[unit("rsu"), output])
     experiment = replayed("log.mcap")
-    assert "recorded" not in experiment["units"]["roadside"]
-    assert "fusion" not in experiment["units"]
+    assert list(experiment["units"]) == ["ego", "rsu"]
     assert experiment["configurations"]["fusion"] == {"recorded": {"topic": "/fusion/objects"}, "inputs": ["rsu"]}
     write_recording(tmp_path / "log.mcap", street(), host=1, more=[output])  # of nothing else: who knows
     assert replayed("log.mcap")["units"]["fusion"] == {"recorded": {"topic": "/fusion/objects"}}
@@ -495,11 +530,37 @@ def test_a_drive_without_ego_beside_one_that_has_one(tmp_path: Path, replayed_to
     draft = replayed_together("street.mcap", "site.mcap")
     street_log, site = draft["logs"]
     assert "ego" not in street_log
-    assert (site["ego"], site["units"]["ego"], site["measure"]) == ("none", None, {"distance_to": "roadside"})
-    assert list(draft["units"]) == ["ego", "roadside"]
+    assert (site["ego"], site["units"]["ego"], street_log["units"]["across"]) == ("none", None, None)
+    assert list(draft["units"]) == ["ego", "roadside", "across"]
     assert "distance_to" not in draft["measure"]
-    assert draft["measure"]["objects"] == {"classes": ["vru", "vehicles"]}  # of the street, of the site
+    assert site["measure"] == {"objects": {"classes": ["vehicles"]}, "distance_to": "roadside"}
+    assert "objects" not in draft["measure"], "of the street all classes, as there is one pedestrian"
+    assert "driver" in draft["braking"], "of the street's ego"
     assert draft["links"]["radio"]["reception"]["kind"] == "constant"  # without an ego no distance to it is known
+
+
+def test_what_the_draft_of_one_log_counts_counts_in_the_study(tmp_path: Path, call: Call) -> None:
+    """The street has five pedestrians and an ego; the site three cars, no ego and a recorded unit. Hours of driving are
+    the street's.
+    """
+    write_recording(tmp_path / "street.mcap", street(walkers=5), host=1)
+    write_recording(tmp_path / "site.mcap", passing(), more=[unit("rsu", velocity=True)])
+    found = []
+    for logs in (("street.mcap",), ("site.mcap",), ("street.mcap", "site.mcap")):
+        (tmp_path / "e.yaml").write_text(call("init", *logs).out.replace("runs: 20", "runs: 1"))
+        found.append(cr.run("e.yaml"))
+    counted = [set(zip(results.known["log"], results.known["object_id"], strict=True)) for results in found]
+    assert counted[0] == {("street", str(k)) for k in range(7, 12)}
+    assert counted[1] == {("site", str(k)) for k in (2, 3, 4)}
+    assert counted[2] == counted[0] | counted[1]
+    both = found[2].known.groupby("configuration")["log"].agg(set).to_dict()
+    everywhere = {"street", "site"}
+    assert both == {
+        "GT": everywhere, "ideal": everywhere, "gnn": everywhere, "alone": {"street"}, "rsu": {"site"},
+        "late": everywhere,
+    }  # fmt: skip
+    of_study, of_street = (found[k].summary.set_index("configuration").loc["ideal"] for k in (2, 0))
+    assert of_study["driving_h"] == of_street["driving_h"]
 
 
 def test_drives_without_an_ego_have_two_masts_each(tmp_path: Path, replayed_together: Drafts) -> None:
@@ -519,12 +580,10 @@ def test_units_that_only_some_drives_have(tmp_path: Path, replayed_together: Dra
     write_recording(tmp_path / "b.mcap", street(), host=1, more=lists)
     draft = replayed_together("a.mcap", "b.mcap")
     assert [name for name, made in draft["units"].items() if "recorded" in made] == ["radar", "lidar", "fusion"]
-    first, second = (log["units"] for log in draft["logs"])
-    assert {name: first[name] for name in ("lidar", "fusion")} == {"lidar": None, "fusion": None}
-    assert None not in second.values()
+    assert [log.get("units") for log in draft["logs"]] == [{"lidar": None, "fusion": None}, None]
     assert draft["configurations"]["recorded"]["units"] == ["radar", "lidar", "fusion"]
     both = replayed_together("b.mcap", "a.mcap")
-    assert [log["units"].get("lidar", "there") for log in both["logs"]] == ["there", None]
+    assert [log.get("units") for log in both["logs"]] == [None, {"lidar": None, "fusion": None}]
 
 
 def test_drives_of_different_formats(tmp_path: Path, replayed_together: Drafts) -> None:
@@ -566,7 +625,7 @@ def test_of_several_every_one_that_cannot_be_read_is_said_and_nothing_is_written
 
 # ----------------------------------------------------------------------------------- what stands there as a comment
 
-EXAMPLES = ("memory", "ghosts", "placed", "clock", "sends", "radio", "window_s", "others")
+EXAMPLES = ("memory", "ghosts", "placed", "clock", "sends", "radio", "window_s", "others", "mast")
 
 
 def uncommented(text: str) -> list[tuple[str, str]]:
@@ -606,7 +665,9 @@ def test_every_example_in_a_comment_holds_as_it_stands(tmp_path: Path, call: Cal
     ego = ["window_s", *of_pem, *of_pem, *of_unit, "others", "radio"]
     assert check_each_alone(call, tmp_path, "ego.mcap") == ego
     assert check_each_alone(call, tmp_path, "site.mcap") == ["window_s", *of_pem, *of_unit, *of_unit, "radio"]
-    assert check_each_alone(call, tmp_path, "ego.mcap", "site.mcap") == ["window_s", *ego]
+    assert check_each_alone(call, tmp_path, "ego.mcap", "site.mcap") == ["window_s", *ego[:-2], *of_unit, *ego[-2:]]
+    write_recording(tmp_path / "unit.mcap", passing(), more=[unit("rsu")])
+    assert check_each_alone(call, tmp_path, "unit.mcap") == ["window_s", *of_pem, "mast", "radio"]
 
 
 OF_EACH_SOURCE = {path.stem.split("_")[0]: path for path in sorted(SHARED.glob("*.mcap"), reverse=True)}
@@ -617,7 +678,8 @@ OF_EACH_SOURCE = {path.stem.split("_")[0]: path for path in sorted(SHARED.glob("
 def test_every_example_holds_on_real_recordings(tmp_path: Path, call: Call, path: Path | None) -> None:
     if path is None:
         pytest.skip(f"{SHARED} has no recordings")
-    assert set(check_each_alone(call, tmp_path, path)) >= {*EXAMPLES} - {"others"}
+    of_mast = {"mast"} if survey_recording(path).truth[0].units else {"placed", "clock", "sends"}
+    assert set(check_each_alone(call, tmp_path, path)) >= {"memory", "ghosts", "radio", "window_s", *of_mast}
 
 
 def test_the_first_configuration_beside_the_ideal_is_a_real_fusion(

@@ -5,6 +5,7 @@ Suggestions (the ego, the measured objects, the place of a mast) are guesses fro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -51,6 +52,7 @@ class UnitFound:
     delay_interval_s: list[float] | None = None  # 95 %
     delay: str | None = None  # the delay in words, or that it cannot be told; None: lists state their capture
     oddities: list[str] = field(default_factory=list)  # one line each
+    middle_m: list[float] = field(default_factory=lambda: [0.0, 0.0])  # x, y: of the area in which it lists objects
 
 
 @dataclass(frozen=True)
@@ -77,18 +79,21 @@ class Suggestion:
     """An experiment to begin with.
 
     `ego`: value of the key, None: the host vehicle of the log. `classes`: measured classes, None: all that moves.
-    `masts`: two where most of them come by, the one with more room around it first; `masts_of_all`: where most of all
-    that moves does. `began`: how many objects cross, appear, or are there at the log's start, within `RANGE_M`, of each
-    group of classes and of all that moves (`all`).
+    `few`: a group of classes that is measured only together with all others, as fewer than `FEWEST_COUNTED` of it
+    count: how many. `range_m`: who comes so near is measured; None: nobody comes near, and all are from when they
+    appear. `again_after_s`: who was away for longer counts again; None: nobody was. `began`: how many cross, appear, or
+    are there at the log's start. `masts`: two where most of the measured objects come by, the one with more room around
+    it first. Without an ego distances are from the first unit whose lists are recorded, else from the first mast.
     """
 
     ego: str | dict[str, str] | None
     ego_why: str
     classes: list[str] | None
-    onset: str
+    few: dict[str, int]
+    range_m: float | None
+    again_after_s: float | None
+    began: dict[str, int]
     masts: list[Mast]
-    masts_of_all: list[Mast]
-    began: dict[str, dict[str, int]]
 
 
 @dataclass(frozen=True)
@@ -166,16 +171,18 @@ def survey_as_json(survey: RecordingSurvey) -> dict[str, Any]:
 
 # Suggestions for an experiment.
 
-RANGE_M = 40.0
-"""Distance to the ego within which objects are measured, the same in all drafts, so that drives stay comparable."""
+RANGES_M = (40.0, 80.0, 160.0)
+"""Distances within which objects are measured: the first at which anything counts, so that drives stay comparable."""
 FEWEST_COUNTED = 5
 """With fewer objects that cross or appear, those of the log's start count, too; with fewer still, all classes."""
 MAST_M = 10.0
 """Distance of the mast from the busiest place: beside the lane, not on it."""
-_CELL_M = 10.0
+CELL_M = 10.0
 """Cells of the grid on which the busiest place is sought: two or three lanes wide."""
 _MOVED_M = 10.0
 """An object that moved less is parked, or nearly."""
+AGAIN_AFTER_S = 10.0
+"""Who was away for longer counts again: from there on a replay notes that its first episode alone counts."""
 _MOSTLY = 0.75
 """The least share of a log for which an ego is there: the vehicle that records a log is there nearly throughout."""
 _ROWS = 100_000
@@ -184,42 +191,67 @@ _DRIVEN = ("car", "van", "truck", "bus", "vehicle", "motorcycle")
 _FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle")  # usual names of the vehicle's own frame
 
 
-def suggest_experiment(log: Log, recording: Recording, fields: Fields | None = None) -> Suggestion:
-    """Suggest an experiment on a recording."""
+def suggest_experiment(
+    log: Log, recording: Recording, units: Sequence[UnitFound], fields: Fields | None = None
+) -> Suggestion:
+    """Suggest an experiment on a recording. `units`: whose lists it has."""
     ego, why, recording = _suggest_ego(log, recording, fields)
     scene, truth = recording.scene, recording.truth
     objects = truth.row_object_ix
     number = scene.ego_ix if ego is None or isinstance(ego, dict) else scene.object_number.get(ego, -1)
-    classes, onset, rows = _suggest_measured(scene, truth, number)
-    if not len(rows):
-        rows = np.arange(len(objects))
-    masts = _suggest_masts(truth, rows, objects)
-    everyone = np.flatnonzero(scene.moving[objects] & (objects != number) & _is_near_ego(truth, objects, number))
-    masts_of_all = _suggest_masts(truth, everyone, objects) if classes and len(everyone) else masts
-    groups = {"all": (scene.moving, masts_of_all[0])} | {
-        name: (np.isin(scene.object_class, class_indices((name,))), masts[0]) for name in ("vru", "vehicles")
-    }
-    began = {name: _count_began(truth, number, *group) for name, group in groups.items()}
-    return Suggestion(ego, why, classes, onset, masts, masts_of_all, began)
+    away_m = _measure_away(truth, number, next((unit.middle_m for unit in units if unit.problem is None), None))
+    others = scene.moving & (np.arange(len(scene.moving)) != number)
+    groups = {name: others & np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")}
+    groups["all"] = others
+
+    def ask(which: Bool, range_m: float) -> tuple[list[Mast], dict[str, int], bool]:
+        """Masts for some objects within a range, how these begin, and whether any comes back."""
+        rows = np.flatnonzero(which[objects] if away_m is None else which[objects] & (away_m <= range_m))
+        masts = _suggest_masts(truth, rows if len(rows) else np.arange(len(objects)), objects)
+        near_m = np.hypot(truth.x_m[0] - masts[0].at[0], truth.y_m[0] - masts[0].at[1]) if away_m is None else away_m
+        return masts, *_count_began(truth, near_m, which, range_m)
+
+    found = ((name, which, range_m) for range_m in (*RANGES_M, np.inf) for name, which in groups.items())
+    name, range_m, (masts, began, again) = next(
+        ((name, range_m, asked) for name, which, range_m in found if sum((asked := ask(which, range_m))[1].values())),
+        ("all", RANGES_M[0], ask(others, RANGES_M[0])),
+    )
+    few = dict[str, int]()
+    if name != "all" and sum(began.values()) < FEWEST_COUNTED:
+        of_all = ask(others, range_m)
+        if sum(of_all[1].values()) > sum(began.values()):
+            few, name, (masts, began, again) = {name: sum(began.values())}, "all", of_all
+    classes, within_m = None if name == "all" else [name], None if range_m == np.inf else range_m
+    return Suggestion(ego, why, classes, few, within_m, AGAIN_AFTER_S if again else None, began, masts)
 
 
-def _count_began(truth: Tracks, ego_ix: int, measured: Bool, mast: Mast) -> dict[str, int]:
-    """How many of the objects `measured (N,)` begin how, as `find_episodes` has it: near the ego, else a mast."""
-    objects, time_s = truth.row_object_ix, truth.row_captured_s
-    if ego_ix >= 0:
-        near, shared = _is_near_ego(truth, objects, ego_ix), np.zeros(len(truth.stamp_ns), dtype=bool)
-        shared[truth.frame_ix[objects == ego_ix]] = True
-    else:
-        near = np.hypot(truth.x_m[0] - mast.at[0], truth.y_m[0] - mast.at[1]) <= RANGE_M
-        shared = np.ones(len(truth.stamp_ns), dtype=bool)
-    first_s, near_s = np.full((2, len(measured)), np.inf)
-    asked = shared[truth.frame_ix]
+def _measure_away(truth: Tracks, ego_ix: int, place_m: Sequence[float] | None) -> Float | None:
+    """(P,) metres from the ego, NaN while it is absent, or from a place; None: there is neither."""
+    if ego_ix < 0:
+        return None if place_m is None else np.hypot(truth.x_m[0] - place_m[0], truth.y_m[0] - place_m[1])
+    rows, frames = np.flatnonzero(truth.row_object_ix == ego_ix), np.full((2, len(truth.stamp_ns)), np.nan)
+    frames[:, truth.frame_ix[rows]] = truth.x_m[0, rows], truth.y_m[0, rows]
+    x, y = frames[:, truth.frame_ix]
+    return np.asarray(np.hypot(truth.x_m[0] - x, truth.y_m[0] - y))
+
+
+def _count_began(truth: Tracks, away_m: Float, measured: Bool, range_m: float) -> tuple[dict[str, int], bool]:
+    """How often the objects `measured (N,)` begin how within a range, as `find_episodes` has it, and whether any comes
+    back. A row `away_m (P,)` is NaN where nothing is asked. Who has no frame after its onset does not count.
+    """
+    objects, time_s, asked = truth.row_object_ix, truth.row_captured_s, ~np.isnan(away_m)
+    first_s, last_s = np.full(len(measured), np.inf), np.full(len(measured), -np.inf)
     np.minimum.at(first_s, objects[asked], time_s[asked])
-    np.minimum.at(near_s, objects[asked & near], time_s[asked & near])
-    measured = measured & np.isfinite(near_s) & (np.arange(len(measured)) != ego_ix)
-    at_once, at_start = near_s <= first_s, first_s <= time_s[asked].min(initial=np.inf)
+    np.maximum.at(last_s, objects[asked], time_s[asked])
+    near = np.flatnonzero((away_m <= range_m) & measured[objects] & (time_s < last_s[objects]))
+    new = np.diff(objects[near], prepend=-1) != 0
+    back = ~new & (np.diff(time_s[near], prepend=-np.inf) > AGAIN_AFTER_S)
+    onset = near[new | back]
+    at_once = time_s[onset] <= first_s[objects[onset]]
+    at_once |= back[new | back] & (np.diff(truth.frame_ix, prepend=-2)[onset] != 1)
+    at_start = time_s[onset] <= time_s[asked].min(initial=np.inf)
     groups = {"crossed": ~at_once, "appeared": at_once & ~at_start, "log_start": at_once & at_start}
-    return {word: int((measured & group).sum()) for word, group in groups.items()}
+    return {word: int(group.sum()) for word, group in groups.items()}, bool(back.any())
 
 
 def _suggest_ego(
@@ -288,69 +320,36 @@ def _find_longest_vehicle(scene: Scene, truth: Tracks) -> tuple[str, str]:
     "none" also where it is there for a part of the log only: that log was recorded from beside the road.
     """
     objects, count = truth.row_object_ix, len(scene.object_ids)
-    first, last = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(first, objects, truth.row_captured_s)
-    np.maximum.at(last, objects, truth.row_captured_s)
-    extent = np.zeros((2, count))
-    for k, values in enumerate((truth.x_m[0], truth.y_m[0])):
-        low, high = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(low, objects, values)
-        np.maximum.at(high, objects, values)
-        extent[k] = high - low
-    moved = np.hypot(*extent)
+    low, high = np.full((3, count), np.inf), np.full((3, count), -np.inf)
+    for k, values in enumerate((truth.row_captured_s, truth.x_m[0], truth.y_m[0])):
+        np.minimum.at(low[k], objects, values)
+        np.maximum.at(high[k], objects, values)
+    there_s, moved = high[0] - low[0], np.hypot(*(high - low)[1:])
     drives = scene.moving & np.isin(scene.object_class, class_indices(_DRIVEN))
     if not drives.any():
         return "none", "there is no vehicle to be the ego"
     if scene.moving.sum() < 2:
         return "none", f"{scene.object_ids[int(drives.argmax())]}, the only one that moves, is measured"
-    best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, last[k] - first[k], moved[k]))
+    best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, there_s[k], moved[k]))
     longest = (
         f"of the vehicles that drive, {scene.object_ids[best]} ({CLASSES[scene.object_class[best]]}) "
-        f"is there longest, {first[best]:.1f} – {last[best]:.1f} s"
+        f"is there longest, {low[0, best]:.1f} – {high[0, best]:.1f} s"
     )
-    if last[best] - first[best] < _MOSTLY * scene.end_s:
+    if there_s[best] < _MOSTLY * scene.end_s:
         return "none", f"{longest} of {scene.end_s:.1f} s, and an ego is there nearly all the time"
     return scene.object_ids[best], longest
-
-
-def _suggest_measured(scene: Scene, truth: Tracks, ego_ix: int) -> tuple[list[str] | None, str, Int]:
-    """Classes, onset and rows of the measured objects: vulnerable road users near the ego, else vehicles, else all."""
-    objects = truth.row_object_ix
-    near = _is_near_ego(truth, objects, ego_ix)
-    others = scene.moving[objects] & (objects != ego_ix)
-    kinds = scene.object_class[objects]
-    groups: list[tuple[list[str] | None, Bool]] = [
-        ([name], others & np.isin(kinds, class_indices((name,)))) for name in ("vru", "vehicles")
-    ]
-    groups.append((None, others))
-    for onset, in_reach in (("in_range", near), ("appears", np.ones_like(near))):
-        for classes, which in groups:
-            if (rows := np.flatnonzero(which & in_reach)).size:
-                return classes, onset, rows
-    return None, "in_range", np.flatnonzero(others)
-
-
-def _is_near_ego(truth: Tracks, objects: Int, ego_ix: int) -> Bool:
-    """(P,) whether a row is in range of the ego; all are without an ego."""
-    if ego_ix < 0:
-        return np.ones(len(objects), dtype=bool)
-    x, y = np.full(len(truth.stamp_ns), np.nan), np.full(len(truth.stamp_ns), np.nan)
-    ego_rows = np.flatnonzero(objects == ego_ix)
-    x[truth.frame_ix[ego_rows]], y[truth.frame_ix[ego_rows]] = truth.x_m[0, ego_rows], truth.y_m[0, ego_rows]
-    away = np.hypot(truth.x_m[0] - x[truth.frame_ix], truth.y_m[0] - y[truth.frame_ix])
-    return np.asarray(away <= RANGE_M)  # NaN, the ego is not there: no
 
 
 def _suggest_masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
     """Two masts that face each other across the busiest place of measured objects, the one with more room first."""
     rows = rows[:: max(1, len(rows) // _ROWS)]
     x, y = truth.x_m[0, rows], truth.y_m[0, rows]
-    cells = np.stack([np.floor(x / _CELL_M), np.floor(y / _CELL_M)], axis=1)
+    cells = np.stack([np.floor(x / CELL_M), np.floor(y / CELL_M)], axis=1)
     visits = np.unique(np.column_stack([cells, objects[rows]]), axis=0)
     places, counts = np.unique(visits[:, :2], axis=0, return_counts=True)
     busiest = places[counts == counts.max()]
     middle = np.array([np.median(x), np.median(y)])
-    inside = (cells == busiest[np.hypot(*((busiest + 0.5) * _CELL_M - middle).T).argmin()]).all(axis=1)
+    inside = (cells == busiest[np.hypot(*((busiest + 0.5) * CELL_M - middle).T).argmin()]).all(axis=1)
     centre = np.array([x[inside].mean(), y[inside].mean()])
     step = max(1, len(truth.x_m[0]) // _ROWS)
     everyone = np.stack([truth.x_m[0, ::step], truth.y_m[0, ::step]], axis=1)
@@ -358,10 +357,4 @@ def _suggest_masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
     around = [centre + MAST_M * np.array([np.cos(t), np.sin(t)]) for t in turns]
     free = [float(np.hypot(*(everyone - place).T).min()) for place in around]
     best = int(np.argmax(np.round(free, 3)))
-    return [_make_mast(centre, float(turns[(best + more) % 8])) for more in (0, 4)]
-
-
-def _make_mast(centre: Float, turn: float) -> Mast:
-    place = centre + MAST_M * np.array([np.cos(turn), np.sin(turn)])
-    facing = round(np.rad2deg(turn)) - 180
-    return Mast([round(float(v), 1) for v in place], facing + 360 if facing <= -180 else facing)
+    return [Mast([round(float(v), 1) for v in around[k]], 180 - -45 * k % 360) for k in (best, (best + 4) % 8)]

@@ -15,6 +15,7 @@ from copem_replay.core.errors import InputError, RecordingError
 from copem_replay.core.frame import check_scale, write_degrees
 from copem_replay.core.tracks import CLASSES, Bool, Float, Scene
 from copem_replay.experiment.draft.findings import (
+    CELL_M,
     EgoFound,
     ProposalFound,
     RecordingSurvey,
@@ -138,6 +139,8 @@ def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> 
     """The lists of a unit: their own properties, and those by comparison with the truth, `known`."""
     between_s = np.diff(np.unique(recorded.tracks.stamp_ns)) * 1e-9
     lists = len(recorded.tracks.stamp_ns)
+    x_m, y_m = recorded.tracks.x_m[0], recorded.tracks.y_m[0]
+    cells = np.unique(np.floor(np.stack([x_m, y_m], axis=1) / CELL_M), axis=0)
     return UnitFound(
         topic,
         lists=lists,
@@ -147,6 +150,7 @@ def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> 
         captures_said=bool(recorded.capture_said.all()),
         velocities_said=recorded.velocity_said or not len(recorded.tracks.frame_ix),
         problem=None if lists else "holds no list",
+        middle_m=(CELL_M * (np.median(cells, axis=0) + 0.5)).tolist() if len(cells) else [0.0, 0.0],
         **known,
     )
 
@@ -198,6 +202,7 @@ def _survey_truth(
     between_s = np.diff(truth.stamp_ns) * 1e-9
     longest = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
+    found = list(_survey_units(recording, units))
     return TruthFound(
         topic=recording.topic,
         frames=len(truth.stamp_ns),
@@ -220,8 +225,8 @@ def _survey_truth(
         notes=list(recording.notes),
         place=_describe_place(log, recording),
         vehicles=moving_ids(scene, shown=6),
-        units=list(_survey_units(recording, units)),
-        suggested=suggest_experiment(log, recording, fields),
+        units=found,
+        suggested=suggest_experiment(log, recording, found, fields),
     )
 
 

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from copem_replay.core.errors import count_noun, escape_unprintable
@@ -15,7 +15,7 @@ from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import dump_on_one_line
 from copem_replay.experiment.draft.findings import (
     FEWEST_COUNTED,
-    RANGE_M,
+    RANGES_M,
     ProposalFound,
     RecordingSurvey,
     Role,
@@ -32,15 +32,19 @@ _GENERIC = {"objects", "object", "sensordata", "detections", "tracks", "lists", 
 _FUSED = {"fusion", "fused", "stack"}
 """Words in the topic of a stack's own output."""
 _KINDS = {"vru": "pedestrians, bicycles, motorcycles", "vehicles": "cars, trucks, …"}
+_MASTS = ("roadside", "across")
 _OTHERS = 6  # topics listed in comments, at most: a line each
 
 
 @dataclass(frozen=True)
 class _Drive:
-    """A log of a draft: its survey, and the list of true objects that is taken."""
+    """A log of a draft: its survey, the list of true objects that is taken, and the lists of its units by their names
+    in the draft.
+    """
 
     survey: RecordingSurvey
     truth: TruthFound
+    lists: Mapping[str, UnitFound] = field(default_factory=dict)
 
     @property
     def guess(self) -> Suggestion:
@@ -50,84 +54,83 @@ class _Drive:
     def has_ego(self) -> bool:
         return self.guess.ego != "none"
 
-    def find_unit(self, topic: str) -> UnitFound | None:
-        """The lists on a topic; None: the log has none, or none that can be read."""
-        return next((unit for unit in self.truth.units if unit.topic == topic and unit.problem is None), None)
+    @property
+    def units(self) -> list[str]:
+        """The names of its units: recorded ones, else masts; and the ego's, as it is recorded or a modelled one."""
+        masts = [] if self.lists else ["roadside"] if self.has_ego else ["roadside", "across"]
+        return ["ego"] * (self.has_ego and not any(map(_is_of_ego, self.lists))) + masts + [*self.lists]
+
+    @property
+    def measured(self) -> dict[str, str]:
+        """The keys of `measure` that a log may have for itself, as text."""
+        again = "" if self.guess.again_after_s is None else f", again_after_s: {self.guess.again_after_s:g}"
+        near = "appears" if self.guess.range_m is None else f"in_range, range_m: {self.guess.range_m:g}"
+        return {
+            "objects": f"{{classes: {dump_on_one_line(self.guess.classes)}}}",
+            "onset": f"{{kind: {near}{again}}}",
+            "distance_to": "ego" if self.has_ego else self.units[0],
+        }
 
 
 def format_draft(*surveys: RecordingSurvey) -> str:
     """The experiment on one log or several, each surveyed, with a comment on each key; it runs unchanged."""
     drives = [_Drive(survey, max(survey.truth, key=lambda truth: truth.states)) for survey in surveys]
-    drives, few = _widen_classes(drives)
     recorded, outputs = _name_recorded(drives)
-    ego = any(drive.has_ego for drive in drives)
-    first = ["ego", "roadside"] if ego else ["roadside", "across"]
+    drives = [replace(drive, lists=_find_lists(drive, recorded)) for drive in drives]
+    units = [name for name in ("ego", *_MASTS, *recorded) if any(name in drive.units for drive in drives)]
     lines = [
-        *_draft_head(drives, few),
+        *_draft_head(drives, units),
         "version: 1",
-        *(_draft_only_log(drives[0]) if len(drives) == 1 else _draft_logs(drives, first, recorded)),
+        *(_draft_only_log(drives[0]) if len(drives) == 1 else _draft_logs(drives, units, recorded)),
         "runs: 20   # each with its own draws, the same in all configurations; more say nothing of other drives",
         "seed: 1",
         "",
         "# Perception error models: is an object in a unit's list, and how far off? The first couple whose `when`",
         "# holds applies; where none holds, nothing is listed. These numbers are examples: yours belong here.",
         "pems:",
-        *_ONBOARD * ego,
+        *_ONBOARD * ("ego" in units),
         *_ROADSIDE,
         "",
         "units:",
-        *_draft_units(drives, recorded, ego=ego),
+        *_draft_units(drives, units, recorded),
         "",
         *_draft_links(drives),
         "",
         "configurations:",
-        *_draft_configurations(first, [name for name, _ in recorded], ego=ego),
-        *_draft_outputs(outputs, [name for name, _ in recorded]),
+        *_draft_configurations(units, list(recorded)),
+        *_draft_outputs(outputs, list(recorded)),
         "",
-        *_draft_measure(_merge_measured(drives), few, ego=ego),
-        *_draft_braking(drives, ego=ego),
+        *_draft_measure(drives),
+        *_draft_braking(drives),
         *_draft_gap(drives),
         "show: {run: 0}   # the run that replay.mcap and replay.rrd show; {run: null} writes none",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _widen_classes(drives: list[_Drive]) -> tuple[list[_Drive], tuple[str, str] | None]:
-    """The drives, with all classes where too few of their own would count; then who these are, and their key."""
-    merged = _merge_measured(drives)
-    counted, of_all = _sum_began(merged).total(), sum(merged.began["all"].values())
-    if merged.classes is None or merged.onset == "appears" or counted >= FEWEST_COUNTED or of_all <= counted:
-        return drives, None
-    wide = [replace(drive.guess, classes=None, masts=drive.guess.masts_of_all) for drive in drives]
-    widened = [replace(drive, truth=replace(drive.truth, suggested=of)) for drive, of in zip(drives, wide, strict=True)]
-    said = " and ".join(_KINDS[name] for name in merged.classes)
-    return widened, (
-        f"{said} only {counted}",
-        f"objects: {{classes: {dump_on_one_line(merged.classes)}}}   # {said} alone",
-    )
+def _is_of_ego(name: str) -> bool:
+    """Whether a unit is the ego's, by its name."""
+    return name.startswith("ego")
 
 
-def _sum_began(guess: Suggestion) -> Counter[str]:
-    """How many of the measured classes begin how."""
-    began = Counter[str]()
-    for name in guess.classes or ["all"]:
-        began.update(guess.began[name])
-    return began
+def _sum_few(drives: Sequence[_Drive]) -> tuple[str, str] | None:
+    """Who is measured only together with all others, and the key for them alone; None: not so in each log."""
+    few = sum((Counter(drive.guess.few) for drive in drives), Counter[str]())
+    if len(few) != 1 or not all(drive.guess.few for drive in drives):
+        return None
+    ((name, counted),) = few.items()
+    return f"of {_KINDS[name]} only {counted} would count", f"objects: {{classes: [{name}]}}   # {_KINDS[name]} alone"
 
 
-def _counts_all(guess: Suggestion) -> bool:
-    """Whether objects of the log's start count, too, for there are few others."""
-    began = _sum_began(guess)
-    return began["crossed"] + began["appeared"] < FEWEST_COUNTED
-
-
-def _draft_head(drives: Sequence[_Drive], few: tuple[str, str] | None) -> Iterator[str]:
+def _draft_head(drives: Sequence[_Drive], units: Sequence[str]) -> Iterator[str]:
     of = _format_comment(drives[0].survey.recording) if len(drives) == 1 else f"{len(drives)} drives"
     span_s = sum(drive.truth.span_s for drive in drives)
     yield f"# Replays {of}, {span_s:.1f} s: {_describe_objects([drive.truth for drive in drives])}."
-    if few is not None:
-        yield f"# All classes are measured: of {few[0]} would count."
+    if (few := _sum_few(drives)) is not None:
+        yield f"# All classes are measured: {few[0]}."
         yield "# What stands behind `#` below `measure:` measures them alone."
+    if "roadside" in units:
+        yield f"# The mast{'s are examples' if 'across' in units else ' is an example'}, where most of them come by."
     yield "# Written by `copem-replay init`, as a starting point. A key behind a `#` can be used as it stands, without"
     yield "# the `#` (<id> stands for an object's)."
     yield "#"
@@ -147,50 +150,46 @@ def _draft_window(truth: TruthFound) -> str:
     return f"# window_s: [0, {math.ceil(10 * truth.span_s) / 10:.1f}]   # the part that is read; left out: all of it"
 
 
-def _draft_logs(
-    drives: Sequence[_Drive], first: Sequence[str], recorded: Sequence[tuple[str, UnitFound]]
-) -> Iterator[str]:
-    """`logs:`, an entry for each, with what is its own: the ego, how it is read, where the masts are, which units."""
+def _draft_logs(drives: Sequence[_Drive], units: Sequence[str], recorded: Mapping[str, UnitFound]) -> Iterator[str]:
+    """`logs:`, an entry for each, with what is its own: the ego, how it is read, which units, and who counts."""
     yield "logs:   # relative to this file, or absolute; keys of an entry replace those below, in this log only"
     for drive in drives:
         truth = drive.truth
         yield f"  - file: {quote_yaml(drive.survey.log)}   # {truth.span_s:.1f} s: {_describe_objects([truth])}"
         own = [*_draft_read(drive.survey, truth), *_draft_ego(truth, drive.guess), _draft_window(truth)]
-        own += [
-            f"# {quote_yaml(u.topic)} cannot be a unit: {_format_comment(u.problem)}" for u in truth.units if u.problem
-        ]
-        own.append(f"units: {{{', '.join(_draft_own_units(drive, first, recorded))}}}")
-        if not drive.has_ego and first[0] == "ego":
-            own.append("measure: {distance_to: roadside}   # there is no ego: ranges and distances are from here")
+        own += _draft_unreadable(truth)
+        changed = {
+            "units": _draft_own_units(drive, units, recorded),
+            "measure": [f"{key}: {of}" for key, of in drive.measured.items() if of != drives[0].measured[key]],
+        }
+        own += [f"{key}: {{{', '.join(of)}}}" for key, of in changed.items() if of]
+        if _sum_few(drives) is None and (few := _sum_few([drive])) is not None:
+            own.append(f"# all classes are measured here: {few[0]}")
         yield from (f"    {line}" for line in own)
 
 
-def _draft_own_units(drive: _Drive, first: Sequence[str], recorded: Sequence[tuple[str, UnitFound]]) -> Iterator[str]:
-    """What is otherwise of the units in one log: the places of masts, and units that it lacks."""
-    if first[0] == "ego" and not drive.has_ego:
-        yield "ego: null"
-    for name, mast in zip((name for name in first if name != "ego"), drive.guess.masts, strict=False):
-        yield f"{name}: {{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}}}"
-    for name, everywhere in recorded:
-        unit = drive.find_unit(everywhere.topic)
-        if unit is None:
-            yield f"{name}: null"
-        elif _format_recorded(unit) != _format_recorded(everywhere):
-            yield f"{name}: {{recorded: {_format_recorded(unit)}}}"
+def _draft_own_units(drive: _Drive, units: Sequence[str], recorded: Mapping[str, UnitFound]) -> list[str]:
+    """What is otherwise of the units in one log: their places, and those that it lacks."""
+    masts, own = iter(drive.guess.masts), {}
+    for name in units:
+        if name not in drive.units:
+            own[name] = "null"
+        elif name in _MASTS:
+            mast = next(masts)
+            own[name] = f"{{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}}}"
+        elif name in recorded:
+            unit = drive.lists[name]
+            keys = [] if drive.has_ego else [f"at: {dump_on_one_line(unit.middle_m)}"]
+            of = _format_recorded(unit)
+            keys += [f"recorded: {of}"] * (of != _format_recorded(recorded[name]))
+            own |= {name: f"{{{', '.join(keys)}}}"} if keys else {}
+    return [f"{name}: {of}" for name, of in own.items()]
 
 
-def _merge_measured(drives: Sequence[_Drive]) -> Suggestion:
-    """What is measured in all logs alike: the classes that any of them suggests, from the instant that suits most."""
-    guesses = [drive.guess for drive in drives]
-    classes = None if any(guess.classes is None for guess in guesses) else [
-        name for name in ("vru", "vehicles") if any(name in (guess.classes or ()) for guess in guesses)
-    ]  # fmt: skip
-    onset = "appears" if all(guess.onset == "appears" for guess in guesses) else "in_range"
-    began = {
-        name: {word: sum(guess.began[name][word] for guess in guesses) for word in words}
-        for name, words in guesses[0].began.items()
-    }
-    return replace(guesses[0], classes=classes, onset=onset, began=began)
+def _draft_unreadable(truth: TruthFound) -> Iterator[str]:
+    for unit in truth.units:
+        if unit.problem:
+            yield f"# {quote_yaml(unit.topic)} cannot be a unit: {_format_comment(unit.problem)}"
 
 
 def take_proposal(survey: RecordingSurvey) -> RecordingSurvey | None:
@@ -264,13 +263,10 @@ _OF_UNIT = [
     "    # clock: {offset_sigma_s: 0.02}   # its clock is off",
     "    # sends: {kind: cpm, interval_s: 0.1}   # which of its lists and objects it sends; left out: all",
 ]
-_LATENCY = "latency: {kind: gamma, min_s: 0.02, mean_s: 0.06, shape: 2}"
 
 
 def _describe_objects(truths: Sequence[TruthFound]) -> str:
-    moving = Counter[str]()
-    for truth in truths:
-        moving.update(truth.moving)
+    moving = sum((Counter(truth.moving) for truth in truths), Counter[str]())
     return ", ".join(f"{moving[name]} {name}" for name in CLASSES if moving[name]) or "nothing that moves"
 
 
@@ -296,127 +292,144 @@ def _draft_ego(truth: TruthFound, guess: Suggestion) -> Iterator[str]:
         yield "  # centre_from_rear_axle_m: 1.4   # from these poses, often the rear axle's, ahead to its centre"
     else:
         yield f"# {why}"
-        yield f"ego: {quote_yaml(ego)}" + (
-            "" if ego == "none" else "   # a guess; none: no ego, a mast judged by itself"
-        )
+        yield f"ego: {quote_yaml(ego)}{'   # a guess; none: no ego, a mast judged by itself' * (ego != 'none')}"
         if ids := truth.vehicles:
             yield f"# ego: <id>   # of {_format_comment(ids)}"
 
 
-def _draft_units(drives: Sequence[_Drive], recorded: Sequence[tuple[str, UnitFound]], *, ego: bool) -> Iterator[str]:
-    if ego:
+def _draft_units(drives: Sequence[_Drive], units: Sequence[str], recorded: Mapping[str, UnitFound]) -> Iterator[str]:
+    if "ego" in units:
         yield "  ego:   # makes a list per frame, or `rate_hz`"
         yield "    on: ego   # on the roof, or at `height_m`"
         yield "    pem: onboard"
-        yield "  # A mast where most measured objects come by: x, y in metres as in the log, yaw_deg from the x axis"
-    else:
-        yield "  # Two masts that face each other where most objects come by: x, y in metres as in the log"
-    if len(drives) > 1:
-        yield "  # (as in the first log: each log has its own above)"
-    for name, mast in zip(("roadside", "across"), drives[0].guess.masts[: 1 if ego else 2], strict=False):
+    masts = [name for name in _MASTS if name in units]
+    if masts:
+        what = "Two masts, as examples, that face each other" if len(masts) > 1 else "A mast, as an example,"
+        yield f"  # {what} where most measured objects come by: x, y in metres as in the log,"
+        yield "  # yaw_deg from the x axis" + (" (as in one log: each has its own above)" if len(drives) > 1 else "")
+    for name, mast in zip(masts, drives[0].guess.masts, strict=False):
         yield f"  {name}:"
         yield f"    at: {dump_on_one_line(mast.at)}"
         yield f"    yaw_deg: {mast.yaw_deg}"
         yield "    height_m: 6.0"
         yield "    pem: roadside"
         yield from _OF_UNIT
-    if ego:
+    if "ego" in units:
         yield "  # others: {on: {classes: [car, truck], penetration_rate: 0.3}, pem: onboard}   # 30 % of them (V2V)"
     if recorded:
         yield "  # Lists as they were recorded. `delay_s`, `covariance_m2`: for messages that don't say when they were"
         yield "  # captured, and how uncertain they are."
-    for name, unit in recorded:
+    for name, unit in recorded.items():
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
         yield f"  {name}:"
         yield f"    recorded: {_format_recorded(unit)}{late}"
-        yield "    # at: [0.0, 0.0]   # where is it? x, y as in the log, or `on: ego`: without, no picture shows it"
-    for unit in drives[0].truth.units if len(drives) == 1 else ():
-        if unit.problem:
-            yield f"  # {quote_yaml(unit.topic)} cannot be a unit: {_format_comment(unit.problem)}"
+        place, what = dump_on_one_line(unit.middle_m), "where is it? x, y as in the log"
+        if any(name in drive.lists and not drive.has_ego for drive in drives):
+            yield f"    at: {place}   # a guess, the middle of what it lists: {what}"
+        else:
+            yield f"    # at: {place}   # {what}, or `on: ego`: without, no picture shows it"
+    if not masts:
+        place = f"at: {dump_on_one_line(drives[0].guess.masts[0].at)}, yaw_deg: {drives[0].guess.masts[0].yaw_deg}"
+        yield f"  # mast: {{{place}, height_m: 6.0, pem: roadside}}   # a modelled one, for configurations that name it"
+    if len(drives) == 1:
+        yield from (f"  {line}" for line in _draft_unreadable(drives[0].truth))
 
 
 def _draft_links(drives: Sequence[_Drive]) -> Iterator[str]:
     """A link that no configuration uses yet; without an ego its reception cannot go by the way to it."""
-    to_ego = all(drive.has_ego for drive in drives)
+    reception = "{kind: constant, probability: 0.9}"
+    if all(drive.has_ego for drive in drives):
+        reception = "{kind: shadowing, half_at_m: 150, exponent: 2.27, sigma_db: 3, blocked_db: 9}"
     yield "links:   # how lists travel: only a configuration with `link` uses it, such as the last one"
-    yield f"  radio: {{{_LATENCY}, reception: " + (
-        "{kind: shadowing, half_at_m: 150, exponent: 2.27, sigma_db: 3, blocked_db: 9}}"
-        if to_ego
-        else "{kind: constant, probability: 0.9}}"
-    )
+    yield f"  radio: {{latency: {{kind: gamma, min_s: 0.02, mean_s: 0.06, shape: 2}}, reception: {reception}}}"
 
 
-def _draft_configurations(first: Sequence[str], recorded: Sequence[str], *, ego: bool) -> Iterator[str]:
-    """Configurations: the truth, all units by ideal and by a real fusion, one unit alone, and all of them late."""
-    both, gnn = f"{{units: [{', '.join(first)}]", "fusion: {kind: gnn}"
+def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iterator[str]:
+    """Configurations: the truth, all units by ideal and by a real fusion, each on its own, and all of them late."""
+    every, gnn, ego = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}", [*filter(_is_of_ego, units)]
+    others = [name for name in recorded if name not in ego]
     rows = [
         ("GT", "{units: truth}", "all that is there, at once, without error"),
-        ("ideal", f"{both}, fusion: {{kind: ideal}}}}", "all units, fused by truth ids: the baseline of `compare`"),
-        ("gnn", f"{both}, {gnn}}}", "a fusion without truth ids"),
-        ("alone", f"{{units: [{first[0]}], {gnn}}}", "the vehicle on its own" if ego else "one mast on its own"),
-        ("late", f"{both}, {gnn}, latency_s: 0.5}}", "all lists half a second late"),
-    ]  # fmt: skip
-    for name in recorded:
-        rows.append((name, f"{{units: [{name}], {gnn}}}", "as it was recorded"))
-        if not (ego and name.startswith("ego")):  # else the ego twice, as recorded and as modelled
-            rows.append((f"with {name}", f"{{units: [{first[0]}, {name}], {gnn}}}", "and together"))
-    if len(recorded) > 1:
-        rows.append(("recorded", f"{{units: [{', '.join(recorded)}], {gnn}}}", "all of them"))
-    link = "{ego: none, default: radio}" if ego else "radio"
+        ("ideal", f"{every}, fusion: {{kind: ideal}}}}", "all units, fused by truth ids: the baseline of `compare`"),
+    ]
+    if len(units) > 1:
+        rows.append(("gnn", f"{every}, {gnn}}}", "a fusion without truth ids"))
+    if ego:
+        rows.append(("alone", f"{{units: [{', '.join(ego)}], {gnn}}}", "the vehicle on its own"))
+    elif "roadside" in units:
+        rows.append(("alone", f"{{units: [roadside], {gnn}}}", "one mast on its own"))
+    rows += [(name, f"{{units: [{name}], {gnn}}}", "as it was recorded") for name in others]
+    if len(others) > 1 and {*others} != {*units}:
+        rows.append(("recorded", f"{{units: [{', '.join(others)}], {gnn}}}", "all of them"))
+    rows.append(("late", f"{every}, {gnn}, latency_s: 0.5}}", "all lists half a second late"))
+    link = f"{{{', '.join(f'{name}: none' for name in ego)}, default: radio}}" if ego else "radio"
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
         yield f"  {name + ':':<{width}} {value}   # {what}"
-    yield f"  # radio: {both}, {gnn}, link: {link}}}   # the lists{' of the others' * ego} by radio"
+    yield f"  # radio: {every}, {gnn}, link: {link}}}   # the lists{' of the others' * bool(ego)} by radio"
 
 
-def _draft_outputs(outputs: Sequence[tuple[str, UnitFound]], recorded: Sequence[str]) -> Iterator[str]:
+def _draft_outputs(outputs: Mapping[str, UnitFound], recorded: Sequence[str]) -> Iterator[str]:
     """Configurations of a stack's recorded outputs, told by their topics: measured like a fusion."""
-    for name, unit in outputs:
+    for name, unit in outputs.items():
         yield "  # Its name suggests a stack's own output, with these units as inputs; if it is not, make it a unit"
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
         late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
         yield f"  {name}: {{recorded: {_format_recorded(unit)}, inputs: [{', '.join(recorded)}]}}{late}"
 
 
-def _draft_measure(guess: Suggestion, few: tuple[str, str] | None, *, ego: bool) -> Iterator[str]:
+def _counts_all(guess: Suggestion) -> bool:
+    """Whether objects of the log's start count, too, for there are few others."""
+    return guess.range_m is None or guess.began["crossed"] + guess.began["appeared"] < FEWEST_COUNTED
+
+
+def _draft_measure(drives: Sequence[_Drive]) -> Iterator[str]:
+    guess, keys, few = drives[0].guess, drives[0].measured, _sum_few(drives)
+    began = sum((Counter(drive.guess.began) for drive in drives), Counter[str]())
+    counts_all = any(_counts_all(drive.guess) for drive in drives)
     yield "measure:"
     if few is not None:
         yield f"  # {few[1]}"
-        if not _counts_all(guess):
+        if not counts_all:
             yield "  # began: [log_start, crossed, appeared]   # with them"
     elif guess.classes:
         text = ", ".join(_KINDS[name] for name in guess.classes)
-        yield f"  objects: {{classes: {dump_on_one_line(guess.classes)}}}   # {text}; or {{ids: [1, 2]}}; left out: all"
+        yield f"  objects: {keys['objects']}   # {text}; or {{ids: [1, 2]}}; left out: all"
     else:
         yield "  # objects: {classes: [vru]}   # left out: all that moves but the ego"
-    if guess.onset == "appears":
-        yield f"  onset: {{kind: appears}}   # the clock starts; in_range: nobody is within {RANGE_M:g} m of the ego"
+    what = "or appears, starts_moving, line_of_sight"
+    if guess.range_m is None:
+        what = f"in_range: nobody is within {RANGES_M[-1]:g} m"
+    elif guess.range_m > RANGES_M[0]:
+        what = f"nobody comes nearer than {RANGES_M[RANGES_M.index(guess.range_m) - 1]:g} m"
+    yield f"  onset: {keys['onset']}   # the clock starts; {what}"
+    numbers = ", ".join(f"{began[word]} {word}" for word in ("crossed", "appeared", "log_start"))
+    if guess.range_m is None:
+        yield "  began: [log_start, crossed, appeared]   # who counts: all, for nobody crosses into view"
+    elif counts_all:
+        few_others = "there are only" if len(drives) == 1 else "in a log few others do:"
+        yield f"  began: [log_start, crossed, appeared]   # who counts: all, for {few_others} {numbers}"
     else:
-        yield (
-            f"  onset: {{kind: in_range, range_m: {RANGE_M:g}}}   # the clock starts; or appears, starts_moving, "
-            "line_of_sight"
-        )
-    yield _draft_began(guess)
+        yield f"  # began: [crossed, appeared]   # who counts; left out: these ({numbers})"
     yield "  horizon_s: 5   # means are of min(time, 5 s)"
-    if not ego:
-        yield "  distance_to: roadside   # there is no ego: ranges and distances are from here"
+    if keys["distance_to"] != "ego":
+        yield f"  distance_to: {keys['distance_to']}   # there is no ego: ranges and distances are from here"
     yield "  confirm: {hits: 1, of: 1}   # known when so many of the last lists hold it"
 
 
-def _draft_braking(drives: Sequence[_Drive], *, ego: bool) -> Iterator[str]:
-    """A driver, where each log has an ego of known size; without velocities in lists he is not asked when he brakes for
-    nothing.
+def _draft_braking(drives: Sequence[_Drive]) -> Iterator[str]:
+    """A driver, where any log has an ego and each ego a known size; without velocities in lists he is not asked when he
+    brakes for nothing.
     """
-    if not ego:
+    if not any(drive.has_ego for drive in drives):
         return
     from copem_replay.metrics.braking.driver import R157  # a survey alone loads no models
 
-    behind = "" if all(drive.has_ego and not isinstance(drive.guess.ego, dict) for drive in drives) else "# "
+    behind = "# " if any(isinstance(drive.guess.ego, dict) for drive in drives) else ""
     silent = any(unit.problem is None and not unit.velocities_said for drive in drives for unit in drive.truth.units)
-    yield f"{behind}braking:   # who brakes for what lists say: the careful and competent driver of UN R157" + (
-        "; needs an ego and its size" if behind else ""
-    )
+    what = "the careful and competent driver of UN R157" + "; needs the size of the ego" * bool(behind)
+    yield f"{behind}braking:   # who brakes for what lists say: {what}"
     yield f"{behind}  driver: {dump_on_one_line(R157)}"
     if silent:
         yield f"{behind}  needless: null   # recorded lists state no velocity: braking for nothing cannot be told"
@@ -430,25 +443,20 @@ def _draft_gap(drives: Sequence[_Drive]) -> Iterator[str]:
         yield f"max_gap_s: {gap_s:g}   # lists come every {1 / slowest_hz:.3g} s: over longer gaps nothing is known"
 
 
-def _draft_began(guess: Suggestion) -> str:
-    """The line of `began`: its default as a comment, or all three words, with the reason."""
-    if guess.onset == "appears":
-        return "  began: [log_start, crossed, appeared]   # who counts: all, for nobody crosses into view"
-    began = _sum_began(guess)
-    numbers = ", ".join(f"{number} {word}" for word, number in began.items())
-    if _counts_all(guess):
-        return f"  began: [log_start, crossed, appeared]   # who counts: all, for there are only {numbers}"
-    return f"  # began: [crossed, appeared]   # who counts; left out: these ({numbers})"
-
-
 _TAKEN = frozenset({
     "ego", "roadside", "across", "others", "default", "truth", "all", "gt", "ideal", "gnn", "alone", "late", "radio",
-    "recorded",
+    "recorded", "mast",
 })  # fmt: skip
 """Names that units and configurations of a draft have already."""
 
 
-def _name_recorded(drives: Sequence[_Drive]) -> tuple[list[tuple[str, UnitFound]], list[tuple[str, UnitFound]]]:
+def _find_lists(drive: _Drive, recorded: Mapping[str, UnitFound]) -> dict[str, UnitFound]:
+    """The lists of a log that can be read, by their names in the draft."""
+    there = {unit.topic: unit for unit in drive.truth.units if unit.problem is None}
+    return {name: there[of.topic] for name, of in recorded.items() if of.topic in there}
+
+
+def _name_recorded(drives: Sequence[_Drive]) -> tuple[dict[str, UnitFound], dict[str, UnitFound]]:
     """The lists that could be read, by names made from their topics: those of units, and outputs of a stack.
 
     Of a topic that several logs have the lists of the first one. An output is the same in all logs, so what only some
@@ -465,15 +473,11 @@ def _name_recorded(drives: Sequence[_Drive]) -> tuple[list[tuple[str, UnitFound]
         telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
         stem = telling[-1] if telling else "lists"
         tries = [stem, *([f"{stem}_recorded"] if stem in _TAKEN else []), *(f"{stem}{k}" for k in range(2, 99))]
-        name = next(name for name in tries if name not in _TAKEN and name not in named)
-        named[name] = unit
-    fused = {
-        name
-        for name, unit in named.items()
-        if _FUSED & set(re.split(r"[^a-z0-9]+", unit.topic.lower())) and all(d.find_unit(unit.topic) for d in drives)
-    }
+        named[next(name for name in tries if name not in _TAKEN and name not in named)] = unit
+    everywhere = {name for name in named if all(name in _find_lists(drive, named) for drive in drives)}
+    fused = {n for n in everywhere if _FUSED & {*re.split(r"[^a-z0-9]+", named[n].topic.lower())}}
     fused = fused if len(fused) < len(named) else set()
-    return [one for one in named.items() if one[0] not in fused], [one for one in named.items() if one[0] in fused]
+    return {n: of for n, of in named.items() if n not in fused}, {n: of for n, of in named.items() if n in fused}
 
 
 def _format_recorded(unit: UnitFound) -> str:
