@@ -281,7 +281,7 @@ def test_lists_of_the_log_become_units(tmp_path: Path, replayed: Callable[..., A
 
 
 def test_a_recorded_roadside_unit_is_asked_as_it_is(tmp_path: Path, replayed: Callable[..., Any]) -> None:
-    """A car alone swings 70 m to both sides of the unit, whose middle is (35, 5): within 40 m of it around 10, 30, 50 and
+    """A car alone swings 70 m to both sides of the unit, which lists around (35, 5): within 40 m around 10, 30, 50 and
     70 s, and away for 12 s in between. It counts four times, from the unit, which is held against its own ideal.
     """
     frames = [(k / 5, [Obj(id=1, x=35 + 70 * np.cos(np.pi * k / 100), y=5.0)]) for k in range(401)]
