@@ -20,6 +20,8 @@ from copem_replay.core import yaml as plain_yaml
 from copem_replay.experiment.draft.findings import Mast
 from copem_replay.experiment.draft.survey import survey_recording
 from copem_replay.experiment.draft.template import format_draft, quote_yaml
+from copem_replay.results.compare import compare_folders
+from copem_replay.results.decision import decide_compared
 from tests.helpers.experiments import drive
 from tests.helpers.recordings import SHARED, Obj, Topic, ns, pedestrian, truth_topic, write_mcap, write_recording
 
@@ -561,6 +563,8 @@ def test_what_the_draft_of_one_log_counts_counts_in_the_study(tmp_path: Path, ca
     }  # fmt: skip
     of_study, of_street = (found[k].summary.set_index("configuration").loc["ideal"] for k in (2, 0))
     assert of_study["driving_h"] == of_street["driving_h"]
+    apart = compare_folders([found[2]], configurations=["alone", "rsu"], baseline="alone")
+    assert decide_compared(apart).sentence == "There is no answer: no log has both alone and another configuration."
 
 
 def test_drives_without_an_ego_have_two_masts_each(tmp_path: Path, replayed_together: Drafts) -> None:
