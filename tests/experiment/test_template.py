@@ -225,6 +225,10 @@ def test_nothing_to_measure_runs_all_the_same(
 ) -> None:
     write_recording(tmp_path / "log.mcap", frames, host=host)
     replayed("log.mcap")
+    said = "# No object counts: beside the ego nothing moves for two frames or more." in format_draft(
+        survey_recording("log.mcap")
+    )
+    assert said == (host == 1 or len(frames) == 1), "without a host the only one that moves is measured"
 
 
 def test_of_several_truths_the_fullest_and_the_others_are_named(tmp_path: Path, replayed: Callable[..., Any]) -> None:
@@ -295,7 +299,7 @@ def test_a_recorded_roadside_unit_is_asked_as_it_is(tmp_path: Path, replayed: Ca
     measure = experiment["measure"]
     assert measure["distance_to"] == "rsu"
     assert measure["onset"] == {"kind": "in_range", "range_m": 40, "again_after_s": 10}
-    assert "only 4 crossed, 0 appeared, 0 log_start" in format_draft(survey_recording("log.mcap"))
+    assert "left out: these (4 crossed, 0 appeared, 0 log_start)" in format_draft(survey_recording("log.mcap"))
     known = cr.load_results("out/begun").known
     assert known[(known["configuration"] == "rsu") & (known["run"] == 0)]["began"].tolist() == ["crossed"] * 4
 

@@ -58,7 +58,9 @@ class _Drive:
     def units(self) -> list[str]:
         """The names of its units: recorded ones, else masts; and the ego's, as it is recorded or a modelled one."""
         masts = [] if self.lists else ["roadside"] if self.has_ego else ["roadside", "across"]
-        return ["ego"] * (self.has_ego and not any(map(_is_of_ego, self.lists))) + masts + [*self.lists]
+        return (
+            ["ego"] * (self.has_ego and not any(name.startswith("ego") for name in self.lists)) + masts + [*self.lists]
+        )
 
     @property
     def measured(self) -> dict[str, str]:
@@ -108,11 +110,6 @@ def format_draft(*surveys: RecordingSurvey) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _is_of_ego(name: str) -> bool:
-    """Whether a unit is the ego's, by its name."""
-    return name.startswith("ego")
-
-
 def _sum_few(drives: Sequence[_Drive]) -> tuple[str, str] | None:
     """Who is measured only together with all others, and the key for them alone; None: not so in each log."""
     few = sum((Counter(drive.guess.few) for drive in drives), Counter[str]())
@@ -129,6 +126,8 @@ def _draft_head(drives: Sequence[_Drive], units: Sequence[str]) -> Iterator[str]
     if (few := _sum_few(drives)) is not None:
         yield f"# All classes are measured: {few[0]}."
         yield "# What stands behind `#` below `measure:` measures them alone."
+    if not any(count for drive in drives for count in drive.guess.began.values()):
+        yield "# No object counts: beside the ego nothing moves for two frames or more."
     if "roadside" in units:
         yield f"# The mast{'s are examples' if 'across' in units else ' is an example'}, where most of them come by."
     yield "# Written by `copem-replay init`, as a starting point. A key behind a `#` can be used as it stands, without"
@@ -347,7 +346,8 @@ def _draft_links(drives: Sequence[_Drive]) -> Iterator[str]:
 
 def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iterator[str]:
     """Configurations: the truth, all units by ideal and by a real fusion, each on its own, and all of them late."""
-    every, gnn, ego = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}", [*filter(_is_of_ego, units)]
+    every, gnn = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}"
+    ego = [name for name in units if name.startswith("ego")]
     others = [name for name in recorded if name not in ego]
     rows = [
         ("GT", "{units: truth}", "all that is there, at once, without error"),
@@ -380,8 +380,9 @@ def _draft_outputs(outputs: Mapping[str, UnitFound], recorded: Sequence[str]) ->
 
 
 def _counts_all(guess: Suggestion) -> bool:
-    """Whether objects of the log's start count, too, for there are few others."""
-    return guess.range_m is None or guess.began["crossed"] + guess.began["appeared"] < FEWEST_COUNTED
+    """Whether objects of the log's start count, too: there are any, and few others."""
+    others = guess.began["crossed"] + guess.began["appeared"]
+    return guess.range_m is None or others < (FEWEST_COUNTED if guess.began["log_start"] else 1)
 
 
 def _draft_measure(drives: Sequence[_Drive]) -> Iterator[str]:
