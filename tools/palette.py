@@ -1,10 +1,10 @@
-"""Search the palettes of `core/colours.py`: python tools/palette.py prints them, a line for each kind of experiment.
+"""Search the palettes of `core/colours.py`: python tools/palette.py prints them, a line for each theme.
 
-A kind is how many configurations there are of each family, eight in all. Candidates are a grid in OKLCh that has the
-contrast to every ground, and keeps away from the greys. Simulated annealing over them asks for ΔE2000 ≥ 15 between
-any two, plainly seen and by a deuteranope, then for one hue within a family, other hues in other families, the same
-hue in both themes, and strong colours. A palette with a greyish colour, which may be taken for the truth, is searched
-again among strong candidates. `tests/core/test_colours.py` holds the result against plain formulas.
+Candidates are a grid in OKLCh that has the contrast to every ground, and keeps away from the grey of the truth. Of the
+dark theme they are so bright that lanes show them nearly unchanged (`tint_for_words`). Simulated annealing over them
+asks for ΔE2000 ≥ 15 between any two, plainly seen, by a deuteranope and by a protanope, then for the hues, one for
+each place, the same in both themes, and strong colours. `tests/core/test_colours.py` holds the result against plain
+formulas.
 
 Sources: OKLab, B. Ottosson, "A perceptual color space for image processing" (2020); rest: `tests/oracles/colour.py`.
 """
@@ -12,7 +12,6 @@ Sources: OKLab, B. Ottosson, "A perceptual color space for image processing" (20
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +19,24 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from copem_replay.core.colours import MOST_COLOURS, REST, TRUTH, Theme
-from tests.oracles.colour import DEUTERANOPE, WHITE, XYZ, contrast
+from copem_replay.core.colours import TRUTH, Theme
+from tests.oracles.colour import DEUTERANOPE, PROTANOPE, WHITE, XYZ, contrast
 
 GROUNDS: dict[Theme, tuple[tuple[int, int, int], ...]] = {
-    "light": ((255, 255, 255), (250, 250, 250)),
     "dark": ((18, 19, 23), (27, 27, 27), (30, 30, 30)),
+    "light": ((255, 255, 255), (250, 250, 250)),
 }
-HUES_DEG = (255, 60, 145, 340, 295, 25, 110, 200)
-"""Hues in OKLCh that families have if they can."""
-APART, APART_FROM_REST, CONTRAST = 15.03, 12.0, 3.02
-GREYISH, MIDDLE, STRONG = 0.06, (0.45, 0.85), 0.09
-"""Chroma in OKLCh below which a colour of middle lightness looks grey, and least chroma of the search after that."""
-STEPS, TRIES = 3000, 8
+HUES_DEG = (255, 55, 145, 340, 295, 100, 200, 15)
+"""Hues in OKLCh that places have if they can."""
+APART, CONTRAST, STRONG, INTENSITY = 15.03, 3.02, 0.09, 0.4
+"""Least ΔE2000 and contrast; least chroma in OKLCh; least intensity (0 to 1) in the dark theme."""
+STEPS, TRIES, PULL = 4000, 12, 0.12
 
 
 def make_candidates(theme: Theme) -> dict[str, Any]:
-    """Colours (N, 3), their hues, strengths, luminances and whether they look grey (N,), least differences (N, N)."""
+    """Colours (N, 3), their hues and strengths (N,), least differences (N, N)."""
     light, strong, hue_deg = (
-        v.ravel() for v in np.meshgrid(np.arange(0.22, 0.96, 0.035), np.arange(0.04, 0.26, 0.03), np.arange(0, 360, 10))
+        v.ravel() for v in np.meshgrid(np.arange(0.22, 0.97, 0.03), np.arange(0.05, 0.3, 0.03), np.arange(0, 360, 10))
     )
     a, b = strong * np.cos(np.radians(hue_deg)), strong * np.sin(np.radians(hue_deg))
     cone = np.stack([light + 0.3963377774 * a + 0.2158037573 * b, light - 0.1055613458 * a - 0.0638541728 * b,
@@ -50,65 +48,36 @@ def make_candidates(theme: Theme) -> dict[str, Any]:
     linear = np.clip(linear[shown], 0, 1)
     colours = np.rint(255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
     colours = colours.astype(int)
-    greys = np.array([TRUTH, REST])
-    apart = _least_apart(colours[:, None], greys[None])
-    kept = (apart[:, 0] >= APART) & (apart[:, 1] >= APART_FROM_REST)
+    kept = (_least_apart(colours, np.array([TRUTH])) >= APART) & (strong[shown] >= STRONG)
     kept &= [min(contrast(tuple(c), ground) for ground in GROUNDS[theme]) >= CONTRAST for c in colours.tolist()]
+    kept &= (theme == "light") | (colours @ np.array([0.299, 0.587, 0.114]) >= 255 * INTENSITY)
     colours = colours[kept]
-    greyish = (strong < GREYISH) & (light > MIDDLE[0]) & (light < MIDDLE[1])
     return {
-        "greyish": greyish[shown][kept],
         "colours": colours, "hue_deg": hue_deg[shown][kept], "strong": strong[shown][kept],
-        "luminance": _linear(colours) @ np.array([0.2126, 0.7152, 0.0722]),
         "apart": _least_apart(colours[:, None], colours[None]),
     }  # fmt: skip
 
 
-def search_strong_palette(shape: tuple[int, ...], of: dict[str, Any], *wanted: Any) -> np.ndarray:
-    """Indices (8,) as `search_palette` finds them, all of strong candidates if some were greyish."""
-    found = search_palette(shape, of, *wanted)
-    if not of["greyish"][found].any():
-        return found
-    kept = np.flatnonzero(of["strong"] >= STRONG)
-    rest = {name: value[kept][:, kept] if name == "apart" else value[kept] for name, value in of.items()}
-    return kept[search_palette(shape, rest, *wanted)]
-
-
-def search_palette(shape: tuple[int, ...], of: dict[str, Any], hues_deg: tuple[float, ...], pull: float) -> np.ndarray:
-    """Indices (8,) of the candidates of a palette, family by family. `pull`: how much `hues_deg` weigh."""
-    family = np.repeat(np.arange(len(shape)), shape)
-    near = 1.5 * np.maximum(0, 15.5 - of["apart"]) ** 2 + np.where(of["apart"] < APART, 6, 0)
-    turned = _turn(of["hue_deg"][:, None], of["hue_deg"][None])
-    within = near + 0.15 * (np.maximum(0, turned - 5) / 10) ** 2
-    across = near + 0.15 * (np.maximum(0, 32 - turned) / 10) ** 2
-    weak = 12 * np.maximum(0, 0.12 - of["strong"]) - of["strong"]
-    own = [weak + pull * (_turn(of["hue_deg"], hue) / 20) ** 2 for hue in hues_deg]
-    random, count = np.random.default_rng(7), len(family)
+def search_palette(of: dict[str, Any], hues_deg: tuple[float, ...]) -> np.ndarray:
+    """Indices (K,) of the candidates of a palette, place by place."""
+    near = 1.5 * np.maximum(0, APART + 0.5 - of["apart"]) ** 2 + np.where(of["apart"] < APART, 6, 0)
+    own = [PULL * (_turn(of["hue_deg"], hue) / 20) ** 2 - 2 * of["strong"] for hue in hues_deg]
+    random, count = np.random.default_rng(7), len(hues_deg)
 
     def cost(i: int, chosen: np.ndarray, others: Any) -> Any:
-        pairs = sum((within if family[i] == family[j] else across)[:, chosen[j]] for j in others)
-        return own[family[i]] + pairs
+        return own[i] + sum(near[:, chosen[j]] for j in others)
 
     best: tuple[float, np.ndarray] = (np.inf, np.empty(0))
     for _ in range(TRIES):
-        chosen = random.integers(len(weak), size=count)
+        chosen = random.integers(len(near), size=count)
         for step in range(STEPS):
             i = int(random.integers(count))
             costs = cost(i, chosen, [j for j in range(count) if j != i])
             chances = np.exp((costs.min() - costs) / (2.5 * (1 - step / STEPS) ** 2 + 0.002))
-            chosen[i] = random.choice(len(weak), p=chances / chances.sum())
+            chosen[i] = random.choice(len(near), p=chances / chances.sum())
         total = sum(float(cost(i, chosen, range(i))[chosen[i]]) for i in range(count))
         best = min(best, (total, chosen), key=lambda found: found[0])
     return best[1]
-
-
-def list_shapes(total: int, most: int | None = None) -> Iterator[tuple[int, ...]]:
-    """Numbers of configurations by family, the largest first."""
-    if total == 0:
-        yield ()
-    for first in range(min(total, most or total), 0, -1):
-        for rest in list_shapes(total - first, first):
-            yield (first, *rest)
 
 
 def _turn(one: Any, other: Any) -> Any:
@@ -127,10 +96,12 @@ def _lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _least_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """ΔE2000, plainly seen or by a deuteranope, whichever is less."""
-    seen = [(_linear(one), _linear(other))]
-    seen.append(tuple(np.clip(linear @ np.array(DEUTERANOPE).T, 0, 1) for linear in seen[0]))
-    return np.minimum(*(_ciede2000(_lab(a), _lab(b)) for a, b in seen))
+    """ΔE2000, plainly seen or by a deuteranope or a protanope, whichever is least."""
+    plain = _linear(one), _linear(other)
+    seen = [plain]
+    for reader in (DEUTERANOPE, PROTANOPE):
+        seen.append(tuple(np.clip(linear @ np.array(reader).T, 0, 1) for linear in plain))
+    return np.minimum.reduce([_ciede2000(_lab(a), _lab(b)) for a, b in seen])
 
 
 def _ciede2000(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -153,20 +124,15 @@ def _ciede2000(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    """Print the palettes of both themes."""
-    candidates = {theme: make_candidates(theme) for theme in GROUNDS}
-    for shape in list_shapes(MOST_COLOURS):
-        hues_deg, pull = tuple(map(float, HUES_DEG)), 0.05
-        for theme, of in candidates.items():
-            families = np.split(search_strong_palette(shape, of, hues_deg, pull), np.cumsum(shape)[:-1])
-            if theme == "light":  # the dark palette keeps the hues of the light one
-                turns = [np.exp(1j * np.radians(of["hue_deg"][k])).sum() for k in families]
-                hues_deg, pull = tuple(float(np.degrees(np.angle(turn)) % 360) for turn in turns), 0.15
-            ranked = [
-                k[np.argsort(of["luminance"][k] * (1 if theme == "light" else -1), kind="stable")] for k in families
-            ]
-            digits = " ".join(bytes(of["colours"][k].tolist()).hex() for k in np.concatenate(ranked))
-            print(theme, f'"{"".join(map(str, shape))}": "{digits}",', flush=True)
+    """Print the palettes of both themes; the light one keeps the hues of the dark one."""
+    hues_deg = tuple(map(float, HUES_DEG))
+    for theme in GROUNDS:
+        of = make_candidates(theme)
+        found = search_palette(of, hues_deg)
+        hues_deg = tuple(of["hue_deg"][found].tolist())
+        least = (of["apart"][np.ix_(found, found)] + np.diag(np.full(len(found), np.inf))).min()
+        digits = " ".join(bytes(of["colours"][k].tolist()).hex() for k in found)
+        print(f'"{theme}": "{digits}",  # least ΔE2000 {least:.1f}, hues {hues_deg}', flush=True)
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
             find_family(recording),
             recording.window,
             draw_truth(run.replayed, table) if show is None or show.truth else None,
-            configuration_colours(run.every, truths={name for name, of in run.every.items() if of.units == TRUTH}),
+            colours=configuration_colours(run.every, {name for name, of in run.every.items() if of.units == TRUTH}),
         )
         check_files_unchanged(stamps)
     return notes

@@ -15,7 +15,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.shown_objects import find_followed, interpolate_places
 from copem_replay.viewer.sink import (
-    WAITING,
+    WORDS_COLOUR,
     RecordingSink,
     configuration_part,
     entity_names,
@@ -257,7 +257,8 @@ def _write_words(
 
     columns = rr.Points3D.columns(positions=stack_float32(*spots), labels=pa.array(labels, pa.string()))
     out.columns(path, elapsed_ns, columns.partition(counts))
-    out.static(path, rr.Points3D.from_fields(colors=[WAITING], radii=rr.Radius.ui_points(points), show_labels=True))
+    size = rr.Radius.ui_points(points)
+    out.static(path, rr.Points3D.from_fields(colors=[WORDS_COLOUR], radii=size, show_labels=True))
 
 
 def write_false_words(

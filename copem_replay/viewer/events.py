@@ -265,7 +265,7 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - strong lines on the ground: distance when an object was first known
 - an arrow at the edge of a view, `61 → 44 m`: object 61 is farther that way, 44 m from the ego
 - white points: units; pale ground with an outline: their fields of view
-- lanes: in full colour *known*, from the time of detection in the table on; at half its strength *listed, not known*,
+- lanes: in full colour *known*, from the time of detection in the table on; darker *listed, not known*,
   since the list does not count: it is from before the onset, not confirmed, or too late; grey and brown: why not; the
   white mark ends at the onset
 - compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""

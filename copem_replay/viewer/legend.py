@@ -16,13 +16,12 @@ from copem_replay.viewer.sink import (
     HIDDEN,
     HIDES,
     LOST,
-    NOTICED,
     OUT,
     STATUS,
     UNLISTED,
     UNMATCHED,
     VISIBLE,
-    WAITING,
+    WORDS_COLOUR,
     RecordingSink,
     scale_colour,
     status_colour,
@@ -40,7 +39,7 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
     ("ego", EGO, 6.0),
     ("hides it", HIDES, 2.0),
     ("field of view", FIELD, 1.0),
-    ("false, dashed", WAITING, 0.9),
+    ("false, dashed", WORDS_COLOUR, 0.9),
 )
 _FALSE, _DISC = _MARKS[-1][0], "disc: place ± 2σ"
 _STATUSES = {
@@ -85,7 +84,7 @@ def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
             for name, _, points, x, y in rows
         ],
         labels=[name for name, *_ in rows],
-        colors=[NOTICED],
+        colors=[WORDS_COLOUR],
         radii=rr.Radius.ui_points(0.0),
         show_labels=True,
     )

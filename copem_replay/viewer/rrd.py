@@ -129,7 +129,7 @@ def write_rrd(
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            colours = configuration_colours(experiment.configurations, truths=truths, selected=part.configurations)
+            colours = configuration_colours(experiment.configurations, truths)
             files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baseline is not None:  # of all objects at once: such a log is not long

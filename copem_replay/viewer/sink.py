@@ -47,14 +47,14 @@ STATUSES = (
 
 # Colours of everything but configurations: ground, truth, statuses, words.
 #
-# Lines have a contrast of 3:1 or more to the dark ground, words 4.5:1, and 3:1 to the grey plate behind words in the
-# viewer's light theme; deuteranopes can tell the statuses apart. Tests compute all of it. Every 3-D view and plot sets
-# the ground, so that it is dark in the light theme, too.
+# Lines have a contrast of 3:1 or more to the dark ground, words 4.5:1, also to the grey plate behind them in the
+# viewer's light theme, and to lanes in both themes; deuteranopes can tell the statuses apart. Tests compute all of it.
+# Every 3-D view and plot sets the ground, so that it is dark in the light theme, too.
 
-GROUND: Rgb = (18, 19, 23)
+GROUND: Rgb = (8, 9, 11)
 GRID: Rgb = (36, 38, 44)
 """Grid on the ground: fainter than any line that carries information."""
-EGO: Rgb = (240, 240, 240)
+EGO: Rgb = (255, 255, 255)
 """The ego and all units."""
 STANDING: Rgb = (112, 112, 112)
 """True objects that never move; moving ones have the truth's grey."""
@@ -66,25 +66,24 @@ ONSET: tuple[Rgb, Rgb] = ((255, 255, 255), (0, 0, 0))
 """Halves of the mark of the onset in lanes, whose ground is that of the theme; elsewhere the first."""
 HIDES: Rgb = (255, 110, 95)
 """Lines to what hides an object."""
-NOTICED: Rgb = (255, 255, 255)
-WAITING: Rgb = (226, 226, 226)
-BEHIND: Rgb = (255, 205, 196)
-"""Words over known, other and hidden objects. Not the configuration's colour: some are too dark to be read. All are
-bright, because the viewer puts words on a grey plate in its light theme."""
+WORDS_COLOUR: Rgb = (255, 255, 255)
+"""Words over objects: nothing darker can be read on the grey plate behind words in the viewer's light theme."""
 DIFFERENCE: Rgb = (255, 255, 255)
 """Marks of objects that only one of two configurations holds."""
 STATUS: dict[int, Rgb] = {
-    OUT: (52, 60, 80),
-    UNLISTED: (88, 76, 54),
-    HIDDEN: (152, 126, 82),
-    VISIBLE: (95, 100, 109),
-    LOST: (208, 192, 158),
-    CAPTURED: (118, 140, 192),
-    UNMATCHED: (190, 202, 228),
+    OUT: (46, 58, 98),
+    UNLISTED: (92, 68, 40),
+    HIDDEN: (205, 160, 100),
+    VISIBLE: (76, 78, 80),
+    LOST: (236, 216, 180),
+    CAPTURED: (140, 165, 225),
+    UNMATCHED: (205, 220, 250),
 }
 """Statuses in which the receiver's list does not hold the object; one colour for all configurations."""
-HALF = 0.5
-"""Strength of a configuration's colour where the object is listed but not known: darker than known, still a colour."""
+FAINT = 1 / 3
+"""Strength of a configuration's colour where the object is listed but not known: so dark that words are white on it."""
+BRIGHT = 0.602
+"""Least intensity (0 to 1) of what has dark words on it in a lane: the viewer's words are white up to 0.6."""
 
 
 DIFFERENCE_TEXT, DIFFERENCE_SHORT = ("difference",), ("difference_short",)
@@ -94,10 +93,19 @@ WORDS, NEAR_WORDS = "status", "status_near"
 
 
 def status_colour(status: int, colour: Rgb) -> Rgb:
-    """Colour of a status in a lane: neutral until the object is listed, then `colour`, at `HALF` until known."""
+    """Colour of a status in a lane: neutral until the object is listed, then `colour`, at `FAINT` until known.
+
+    Known, it is as much lighter as words on it ask: the viewer writes them in black or white, and mixes a lane's
+    colour with the ground of its theme.
+    """
     if status < EARLY:
         return STATUS[status]
-    return colour if status == KNOWN else scale_colour(colour, HALF)
+    if status != KNOWN:
+        return scale_colour(colour, FAINT)
+    intensity = float(np.dot(colour, (0.299, 0.587, 0.114))) / 255
+    lighter = max(BRIGHT - intensity, 0.0) / (1 - intensity)
+    red, green, blue = (round(channel + lighter * (255 - channel)) for channel in colour)
+    return red, green, blue
 
 
 def scale_colour(colour: Rgb, share: float) -> Rgb:

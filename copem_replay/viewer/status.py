@@ -42,14 +42,12 @@ from copem_replay.viewer.camera import below_bodies
 from copem_replay.viewer.sensors import unit_places
 from copem_replay.viewer.sink import (
     ABSENT,
-    BEHIND,
     CAPTURED,
     EARLY,
     HIDDEN,
     HIDES,
     KNOWN,
     LOST,
-    NOTICED,
     OUT,
     STATUSES,
     TOO_LATE,
@@ -57,7 +55,7 @@ from copem_replay.viewer.sink import (
     UNLISTED,
     UNMATCHED,
     VISIBLE,
-    WAITING,
+    WORDS_COLOUR,
     RecordingSink,
     configuration_part,
     elapsed_ns,
@@ -387,9 +385,6 @@ def write_status_words(
     import rerun as rr
 
     rows, column = np.nonzero((statuses.status != ABSENT) & ~np.isnan(statuses.body["x_m"]))
-    colours = np.full((len(rows), 3), WAITING, dtype=np.uint8)
-    status = statuses.status[rows, column]
-    colours[status == HIDDEN], colours[status == KNOWN] = BEHIND, NOTICED
     started = statuses.elapsed_ns[rows] >= clock.onset_ns[sight.object_ix[column]]
     reasons = explain_status(replay.scene, experiment, sight, statuses, rows, column, started)
     counts = np.bincount(rows, minlength=len(statuses.elapsed_ns))
@@ -404,12 +399,12 @@ def write_status_words(
     for entity, headings in up_rad.items():
         place = below_bodies(statuses.body, headings)[:, rows, column]
         columns = rr.Points3D.columns(
-            positions=stack_float32(*place[:, drawn_rows]), labels=reasons.labels.filter(pa.array(drawn_rows)),
-            colors=colours[drawn_rows],
-        )  # fmt: skip
+            positions=stack_float32(*place[:, drawn_rows]), labels=reasons.labels.filter(pa.array(drawn_rows))
+        )
         path = ["world", configuration_part(name), entity]
         out.columns(path, statuses.elapsed_ns[drawn], columns.partition(counts[drawn]))
-        out.static(path, rr.Points3D.from_fields(radii=rr.Radius.ui_points(0.0), show_labels=True))
+        no_dots = rr.Radius.ui_points(0.0)
+        out.static(path, rr.Points3D.from_fields(colors=[WORDS_COLOUR], radii=no_dots, show_labels=True))
         sentences = rr.DynamicArchetype.columns(archetype="why", components={"why": told_then})
         out.columns(path, statuses.elapsed_ns[changes], sentences.partition(counts[changes]))
 

@@ -143,7 +143,7 @@ def test_paths_lead_to_what_is_in_the_statuses(replay: Path) -> None:
 
 def test_curves_have_the_colours_of_their_configurations(replay: Path) -> None:
     (curves,) = panels_of(build_layout(replay, ["coPEM:1s", "PEM"]), "Plot!").values()
-    every = configuration_colours(NAMES, truths=["GT"])
+    every = configuration_colours(NAMES, ["GT"])
     hexed = {name: "#" + bytes(colour).hex() for name, colour in every.items()}
     shown = [(path["label"], path["color"]) for path in curves["paths"]]
     assert shown == [(name, hexed[name]) for name in ("coPEM:1s", "PEM")]

@@ -72,7 +72,8 @@ class Written:
 
     def write(self, path: Path, source: Path = SOURCE) -> list[str]:
         manifest = {"experiment": "version: 1", "run": str(RUN)}
-        return write_mcap(path, source, self.replay.scene, [self.run_tracks], self.table, manifest)
+        colours = configuration_colours(self.run_tracks, ())
+        return write_mcap(path, source, self.replay.scene, [self.run_tracks], self.table, manifest, colours=colours)
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +191,7 @@ def test_ids_beyond_64_bits_are_hashed() -> None:
 
 def test_scene_updates_draw_each_list_anew(written: Written) -> None:
     fused, scene = written.run_tracks["PEM"].fused, written.replay.scene
-    colour = configuration_colours(written.run_tracks)["PEM"]
+    colour = configuration_colours(written.run_tracks, ())["PEM"]
     assert max(colour) > 100
     updates = [m for m in messages(written.path) if m[0] == "copem/PEM/scene"]
     assert len(updates) == len(fused.stamp_ns)
@@ -341,7 +342,8 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     family = find_family(written.recording)
     manifest = {"experiment": "version: 1", "run": str(RUN)}
     path = tmp_path / "out.mcap"
-    write_mcap(path, SOURCE, written.replay.scene, [written.run_tracks], written.table, manifest, family)
+    tracks, colours = [written.run_tracks], configuration_colours(written.run_tracks, ())
+    write_mcap(path, SOURCE, written.replay.scene, tracks, written.table, manifest, family, colours=colours)
     assert path.read_bytes() == written.path.read_bytes()
     with path.open("rb") as file:
         reader = make_reader(file)

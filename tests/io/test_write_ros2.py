@@ -198,6 +198,7 @@ class Written:
             self.table,
             {"run": "0"},
             find_family(self.recording),
+            colours=configuration_colours(self.run_tracks, ()),
         )
 
 
@@ -336,7 +337,7 @@ def test_scene_updates_draw_each_list_anew(written: Written) -> None:
             yaw = 2 * np.arctan2(cube.pose.orientation.z, cube.pose.orientation.w)
             assert np.cos(yaw - fused.yaw_rad[0, p]) == pytest.approx(1)
             assert color.a == 0.5
-            shades = configuration_colours(written.run_tracks)["gnn"]
+            shades = configuration_colours(written.run_tracks, ())["gnn"]
             assert (color.r, color.g, color.b) == tuple(shade / 255 for shade in shades)
 
 
@@ -391,7 +392,9 @@ def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_pat
     (tmp_path / "e.yaml").write_text(EXPERIMENT)
     recording = read_log(source, name="drive", ego=written.experiment.ego)
     target = tmp_path / "out.mcap"
-    write_mcap(target, source, written.replay.scene, [written.run_tracks], written.table, {}, find_family(recording))
+    family, colours = find_family(recording), configuration_colours(written.run_tracks, ())
+    tracks = [written.run_tracks]
+    write_mcap(target, source, written.replay.scene, tracks, written.table, {}, family, colours=colours)
     lists = [m for _, _, m in decoded(target) if hasattr(m, "header")]
     assert {m.header.frame_id for m in lists} == {frame_id.lstrip("/") or "map"}
     assert sum(len(m.objects) for m in lists) == sum(int(b.fused.valid.sum()) for b in written.run_tracks.values())

@@ -1,8 +1,9 @@
-"""How far apart colours are for a reader, written plainly: contrast, and difference to a deuteranope.
+"""How far apart colours are for a reader, written plainly: contrast, and difference for colour-blind readers.
 
 Sources: contrast, WCAG 2.1. ΔE2000, G. Sharma, W. Wu, E. N. Dalal, "The CIEDE2000 color-difference formula", Color
-Research and Application 30 (2005), equation by equation. Deuteranopia, G. M. Machado, M. M. Oliveira, L. A. F.
-Fernandes, "A physiologically-based model for simulation of color vision deficiency", IEEE TVCG 15 (2009), severity 1.
+Research and Application 30 (2005), equation by equation. Deuteranopia and protanopia, G. M. Machado, M. M. Oliveira,
+L. A. F. Fernandes, "A physiologically-based model for simulation of color vision deficiency", IEEE TVCG 15 (2009),
+severity 1.
 CIELAB and ΔE*ab, CIE 1976, D65.
 """
 
@@ -13,6 +14,7 @@ from math import atan2, cos, degrees, exp, hypot, radians, sin, sqrt
 Rgb = tuple[int, ...]
 
 DEUTERANOPE = ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881))
+PROTANOPE = ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998))
 XYZ = ((0.4124564, 0.3575761, 0.1804375), (0.2126729, 0.7151522, 0.0721750), (0.0193339, 0.1191920, 0.9503041))
 WHITE = (0.95047, 1.0, 1.08883)
 
@@ -73,10 +75,12 @@ def ciede2000(one: tuple[float, ...], other: tuple[float, ...]) -> float:
 
 
 def least_apart(one: Rgb, other: Rgb) -> float:
-    """ΔE2000 of two colours, or of what a deuteranope sees of them if that is less."""
+    """ΔE2000 of two colours, or of what a deuteranope or a protanope sees of them if that is less."""
     plain = [linear(colour) for colour in (one, other)]
-    seen = [[min(max(v, 0.0), 1.0) for v in times(DEUTERANOPE, light)] for light in plain]
-    return min(ciede2000(lab(pair[0]), lab(pair[1])) for pair in (plain, seen))
+    seen = [plain]
+    for reader in (DEUTERANOPE, PROTANOPE):
+        seen.append([[min(max(v, 0.0), 1.0) for v in times(reader, light)] for light in plain])
+    return min(ciede2000(lab(pair[0]), lab(pair[1])) for pair in seen)
 
 
 def apart_for_a_deuteranope(one: Rgb, other: Rgb) -> float:

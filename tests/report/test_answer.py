@@ -248,7 +248,7 @@ class TestLooks:
     def test_colours_are_those_of_the_recording(self) -> None:
         """On a dark page; paper has its own, by the same names."""
         names = ["GT", "PEM", *(f"coPEM:{k}s" for k in range(19))]
-        on = {theme: configuration_colours(names, truths=["GT"], theme=theme) for theme in ("light", "dark")}
+        on = {theme: configuration_colours(names, ["GT"], theme) for theme in ("light", "dark")}
         for name, look in choose_appearances(named(names, truths=["GT"])).items():
             assert tuple(round(255 * channel) for channel in look.colour) == on["light"][name]
             assert tuple(round(255 * channel) for channel in look.dark) == on["dark"][name]
@@ -259,9 +259,14 @@ class TestLooks:
         assert look.line()["linewidth"] == 0.75
         assert look.line()["linestyle"] == "-"
 
-    def test_variants_of_a_family_have_markers_of_their_own(self) -> None:
-        looks = choose_appearances(named(["PEM", "coPEM:0s", "coPEM:1s", "masts"]))
-        assert [look.marker for look in looks.values()] == ["o", "o", "s", "o"]
+    def test_up_to_seven_have_markers_of_their_own(self) -> None:
+        looks = choose_appearances(named(["GT", *(f"c{k}" for k in range(8))], truths=["GT"]))
+        assert "".join(look.marker for look in list(looks.values())[1:]) == "os^DvPXs"
+
+    def test_no_two_of_forty_three_look_alike(self) -> None:
+        looks = choose_appearances(named([f"c{k}" for k in range(43)])).values()
+        for of in (lambda look: (look.colour, look.marker), lambda look: (look.dark, look.dashes)):
+            assert len(set(map(of, looks))) == 43
 
     def test_lines_are_seen_on_white_and_on_a_dark_page(self) -> None:
         """WCAG 2.1, 1.4.11: 3 to 1."""

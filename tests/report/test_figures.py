@@ -392,7 +392,7 @@ class TestRuns:
         # Beside each other from 22.75 m on, after 2.275 s; looked for every .05 s.
         begin, nearest = ("clock starts", 0.0), ("nearest: 28.7 m", 2.3)
         assert events(speed) == [begin, ("late: known after 0.5 s", 0.5), nearest]
-        looks = choose_appearances(results, ["late", "never"])
+        looks = choose_appearances(results)
         [mark] = [one for one in gap.get_lines() if one.get_label() == "of late"]
         assert (list(mark.get_xdata()), mark.get_color()) == ([0.5, 0.5], looks["late"].colour)
         # Nearest where the ego passes, 30 − 1 − 0.3 m, 2.5 s after the onset; the log ends after 4.5 s.

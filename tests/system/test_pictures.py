@@ -41,7 +41,7 @@ def test_a_few_dots_keep_their_colours_in_a_dark_window() -> None:
     """Many shades of nearly black, and nine pixels each of the colours that tell configurations apart."""
     shades = np.random.default_rng(1).integers(0, 40, (300, 400))
     pixels = np.repeat(shades[..., None], 3, axis=-1).astype(np.uint8)
-    colours = list(configuration_colours(map(str, range(7))).values())
+    colours = list(configuration_colours(map(str, range(7)), ()).values())
     for k, colour in enumerate(colours):
         pixels[10:13, 10 * k + 10 : 10 * k + 13] = colour
     with Image.open(io.BytesIO(as_png(Image.fromarray(pixels)))) as small:

@@ -51,7 +51,7 @@ def test_the_layout_has_its_views(made: Made, viewer: Viewer) -> None:
 
 def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
     viewer.open(made.path)
-    colours = configuration_colours(made.run_tracks, truths=("GT", "GT late"))
+    colours = configuration_colours(made.run_tracks, ("GT", "GT late"))
     for elapsed_s in (0.3, 2.0, 4.8):
         viewer.seek(elapsed_s)
         for name in ("PEM", "pole"):

@@ -68,20 +68,52 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Made:
 # ------------------------------------------------------------------------------- colours
 
 
-def test_words_and_lines_stand_out_from_the_ground() -> None:
+def test_lines_stand_out_from_the_ground() -> None:
     assert max(contrast(half, palette.GROUND) for half in palette.ONSET) >= 3
     assert max(contrast(half, (255, 255, 255)) for half in palette.ONSET) >= 3, "lanes have the ground of the theme"
-    words = {"known": palette.NOTICED, "waiting": palette.WAITING, "hidden": palette.BEHIND, "ego": palette.EGO}
-    assert {name: contrast(colour, palette.GROUND) >= 4.5 for name, colour in words.items()} == dict.fromkeys(
-        words, True
-    )
-    plate = (121, 121, 123)  # what a light theme puts under words in 3-D views, as it is drawn on the ground
-    assert [name for name, colour in words.items() if contrast(colour, plate) < 3] == []
     lines = {
-        "truth": TRUTH, "standing": palette.STANDING, "lane": palette.LANE, "field": palette.FIELD,
-        "onset": palette.ONSET[0], "difference": palette.DIFFERENCE, **configuration_colours(map(str, range(8))),
+        "truth": TRUTH, "standing": palette.STANDING, "lane": palette.LANE, "field": palette.FIELD, "ego": palette.EGO,
+        "onset": palette.ONSET[0], "difference": palette.DIFFERENCE,
+        **configuration_colours(map(str, range(8)), ()),
     }  # fmt: skip
     assert [name for name, colour in lines.items() if contrast(colour, palette.GROUND) < 3] == []
+
+
+def test_words_of_views_are_read_in_both_themes(city: Made) -> None:
+    """On the ground, and on the plate that the viewer puts under words in its light theme, 0.436 of it white."""
+    plate = tuple(round(255 * 0.436 + 0.564 * channel) for channel in palette.GROUND)
+    found = set()
+    for entity, batch in batches(city.path):
+        shown = next((name for name in batch.schema.names if name.endswith(":show_labels")), None)
+        colours = next((name for name in batch.schema.names if name.endswith(":colors")), None)
+        if shown and colours and batch.column(shown).to_pylist()[0] == [True] and not entity.startswith("/legend"):
+            found |= {(entity.rsplit("/", 1)[-1], *unpack(c)) for c in batch.column(colours).to_pylist()[0]}
+    assert {"status", "status_near", "arrows"} <= {name for name, *_ in found}
+    for name, *colour in found:
+        assert contrast(colour, palette.GROUND) >= 4.5, name
+        assert contrast(colour, plate) >= 4.5, name
+
+
+def test_words_of_lanes_are_read_in_both_themes(city: Made) -> None:
+    """White up to an intensity of 0.6, else black, on 200 of 255 of the colour, the rest ground: as the viewer draws."""
+    drawn = set()
+    for entity, batch in batches(city.path):
+        if entity.startswith("/lanes/") and "StateConfiguration:values" in batch.schema.names:
+            labels, colours = (batch.column(f"StateConfiguration:{of}").to_pylist()[0] for of in ("labels", "colors"))
+            drawn |= {unpack(colour) for label, colour in zip(labels, colours, strict=True) if label.strip()}
+    every = {palette.status_colour(KNOWN, colour) for colour in configuration_colours(map(str, range(8)), ()).values()}
+    assert len(drawn & every) > 3
+    listed = {palette.status_colour(KNOWN - 1, c) for c in configuration_colours(map(str, range(8)), ()).values()}
+    for colour in (*drawn, *every, *listed, *palette.STATUS.values()):
+        red, green, blue = colour
+        bright = 0.299 * red + 0.587 * green + 0.114 * blue > 0.6 * 255
+        for ground in (0, 255):
+            shown = tuple(round((200 * channel + 55 * ground) / 255) for channel in colour)
+            assert contrast(shown, (0, 0, 0) if bright else (255, 255, 255)) >= 4.5, (colour, ground)
+
+
+def unpack(rgba: int) -> tuple[int, int, int]:
+    return rgba >> 24, rgba >> 16 & 255, rgba >> 8 & 255
 
 
 def test_statuses_stay_apart_for_deuteranopes() -> None:
@@ -91,9 +123,9 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
         (a, b) for a, b in combinations(all_of_them, 2) if apart_for_a_deuteranope(all_of_them[a], all_of_them[b]) < 15
     ]
     assert near == []
-    for colour in configuration_colours(map(str, range(8))).values():
-        half = palette.status_colour(KNOWN - 1, colour)
-        assert apart_for_a_deuteranope(half, colour) >= 15, "listed and known"
+    for colour in configuration_colours(map(str, range(8)), ()).values():
+        listed, known = (palette.status_colour(status, colour) for status in (KNOWN - 1, KNOWN))
+        assert apart_for_a_deuteranope(listed, known) >= 15
     # The oracle: black and white are 100 apart, a colour 0 from itself; red and green of one luminance hardly.
     assert apart_for_a_deuteranope((0, 0, 0), (255, 255, 255)) == pytest.approx(100, abs=0.1)
     assert contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21)
@@ -101,15 +133,15 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
 
 
 def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
-    assert palette.DIFFERENCE not in configuration_colours(map(str, range(8))).values()
+    assert palette.DIFFERENCE not in configuration_colours(map(str, range(8)), ()).values()
 
 
 def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
-    """In boxes, lanes, lines, curves, the legend and the figures of the report."""
+    """In boxes, lines, curves, the legend and the figures of the report; in lanes as bright as words ask."""
     from copem_replay.report.figures.style import choose_appearances
 
     truths = [name for name, asked in city.given.configurations.items() if asked.units == "truth"]
-    every = configuration_colours(city.given.configurations, truths=truths)
+    every = configuration_colours(city.given.configurations, truths)
     beside = [name for name in every if name not in truths]
     looks = choose_appearances(named(list(every), truths))
     figures = {name: tuple(round(255 * c) for c in one.dark) for name, one in looks.items()}
@@ -133,7 +165,8 @@ def test_a_configuration_has_one_colour_everywhere(city: Made) -> None:
                           batch.column("StateConfiguration:colors").to_pylist()[0], strict=True))  # fmt: skip
             place = int(entity.rsplit("/", 1)[-1].split("_")[0]) - 1
             known = {colour >> 8 for text, colour in of.items() if "known" in text}
-            assert known <= {number[beside[place]]}
+            red, green, blue = palette.status_colour(KNOWN, every[beside[place]])
+            assert known <= {red << 16 | green << 8 | blue}
     assert found == {name: {number[name]} for name in beside}
 
 

@@ -309,7 +309,7 @@ def test_further_configurations_are_in_further_files(tmp_path: Path) -> None:
     assert "In further files: y.configurations_8.rrd." in static(first, "/summary")["TextDocument:text"][0]
     assert [bool(list(chunks(path, "/world/GT6/boxes"))) for path in (first, second)] == [True, False]
     assert [bool(list(chunks(path, "/world/GT7/boxes"))) for path in (first, second)] == [False, True]
-    every = list(configuration_colours(many).values())
+    every = list(configuration_colours(many, ()).values())
     for path, name, place in ((first, "GT6", 6), (second, "GT7", 7)):
         red, green, blue = every[place]
         drawn = at(path, f"/world/{name}/boxes", 0.95)["Boxes3D:colors"][0] >> 8

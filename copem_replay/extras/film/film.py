@@ -30,6 +30,7 @@ from copem_replay.perception.visibility import rectangle_corners
 from copem_replay.pipeline.one_run import ReplayedRun
 from copem_replay.pipeline.sight import Sight, compute_sight
 from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.figures.style import find_truths
 from copem_replay.results.again import replay_again
 from copem_replay.results.outputs import check_output, made_file
 from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, elapsed_ns, short_ids, to_nanoseconds
@@ -121,7 +122,7 @@ def write_film(
     replayed, rows = replay_again(read, choice.log, choice.run, read.experiment.configurations)
     table = first_episodes(rows)
     read.check_unchanged()
-    every = configuration_colours(read.experiment.configurations)
+    every = configuration_colours(read.experiment.configurations, find_truths(read), "light")
     colours = {name: every[name] for name in choice.configurations}
     return draw_film(path, replayed, table, choice.object_id, colours, read.place)
 

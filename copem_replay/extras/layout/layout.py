@@ -86,7 +86,7 @@ def _find_colours(experiment: str, names: Sequence[str]) -> dict[str, str]:
         truths = {name for name, keys in asked.items() if keys.get("units") == TRUTH}
     except (NotYamlError, AttributeError, TypeError, ValueError, KeyError):
         asked, truths = {}, set()
-    colours = configuration_colours(asked if set(names) <= set(asked) else names, truths=truths)
+    colours = configuration_colours(asked if set(names) <= set(asked) else names, truths)
     return {name: "#{:02x}{:02x}{:02x}".format(*colours[name]) for name in names}
 
 

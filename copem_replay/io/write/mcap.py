@@ -31,7 +31,7 @@ from mcap.opcode import Opcode
 from mcap.records import Message, MessageIndex, Statistics
 from mcap.writer import Writer
 
-from copem_replay.core.colours import Rgb, configuration_colours
+from copem_replay.core.colours import Rgb
 from copem_replay.core.files import atomic_file
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Int, Scene, Tracks
@@ -75,15 +75,15 @@ def write_mcap(
     family: Family | None = None,
     window: Window | None = None,
     truth: TruthScene | None = None,
-    colours: Mapping[str, Rgb] | None = None,
+    *,
+    colours: Mapping[str, Rgb],
 ) -> list[str]:
     """Write `source` with the fused lists of one run added.
 
     `run_tracks`: time chunk by time chunk, the fused tracks by configuration; values (1, P). `table`: the rows of the
     detections table of this log and run. `manifest`: what made the file, kept as a metadata record. `family`: of the
     messages, None: OSI's. `window`: the log time of `source` that was read, None: all. `truth`: drawn beside the lists
-    unless it is None or a configuration has the name of its topics. `colours`: by
-    configuration, None: those of an experiment with no others.
+    unless it is None or a configuration has the name of its topics. `colours`: by configuration.
 
     MCAP has no times before 0. If a list or a frame of the truth is earlier, all added messages are logged later by the
     same time, so that the first of them is at 0; stamps in messages stay by the log's clock.
@@ -94,7 +94,6 @@ def write_mcap(
     original = open_source(source, window)
     rest = iter(run_tracks)
     first = next(rest)  # names the configurations and the units
-    colours = colours or configuration_colours(first)
     units = [unit for fused_tracks in first.values() for unit in fused_tracks.received.units]
     numbers = {unit: k for k, unit in enumerate(dict.fromkeys(units), start=1)}
     tables = {name: table[table["configuration"] == name] for name in first}

@@ -66,7 +66,7 @@ def answer_figure(results: Results, *, configurations: Sequence[str] | None = No
         else:
             figure = new_figure(8.0, 1.0 + height_in)
             panels = figure.subplots(1, count, squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
-        looks = choose_appearances(results, configurations)
+        looks = choose_appearances(results)
         draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=not stacked)
         panels[0].set_xlabel("Mean time to detection (s)")
         _draw_truth_line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")

@@ -83,7 +83,7 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     weigh = results.experiment.measure.weigh
     exact = {} if counted is None else {name: exact_curve(counted, name, weigh) for name in names}
     with figure_style():
-        figure = _draw_curves(curves, exact, choose_appearances(results, configurations))
+        figure = _draw_curves(curves, exact, choose_appearances(results))
         _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
         return figure
 

@@ -79,7 +79,7 @@ def differences_figure(
     with figure_style():
         figure = new_figure(8.0, 1.0 + ROW_IN * len(names))
         panels = figure.subplots(1, len(metrics), squeeze=False, width_ratios=[1.3, 1.0][: len(metrics)])[0]
-        looks = choose_appearances(results, configurations)
+        looks = choose_appearances(results)
         for k, (axes, metric) in enumerate(zip(panels, metrics, strict=True)):
             draw_rows(axes, list(zip(names, dots[metric], strict=True)), looks, named=k == 0)
             _centre_on_zero(axes, dots[metric], metric, comparison.baseline)

@@ -147,7 +147,7 @@ def distances_figure(results: Results, *, configurations: Sequence[str] | None =
     with figure_style():
         figure = new_figure(1.6 + 4.4 * len(events) + 0.6, 1.5 + 0.5 * len(names))
         panels = figure.subplots(1, len(events), sharex=True, sharey=True, squeeze=False)[0]
-        looks = choose_appearances(results, configurations)
+        looks = choose_appearances(results)
         for axes, event in zip(panels, events, strict=True):
             panel_strips = {name: (strips[event, name], points[event, name]) for name in names}
             _draw_panel(axes, event, panel_strips, looks, int(detections["runs"].sum()), top_m)

@@ -59,7 +59,7 @@ def false_positives_figure(results: Results, *, configurations: Sequence[str] | 
     names = _contenders_with_both(results, asked)
     rows = results.summary.set_index("configuration")
     error_m, rate = (rows.loc[names, key].to_numpy(dtype=float) for key in (_ERROR, _FALSE))
-    looks, short = choose_appearances(results, configurations), shorten_names(names)
+    looks, short = choose_appearances(results), shorten_names(names)
     with figure_style():
         figure = new_figure(_WIDE_IN, _HIGH_IN + 0.06 * max(len(names) - 8, 0))
         axes = figure.subplots()

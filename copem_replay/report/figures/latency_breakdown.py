@@ -121,7 +121,7 @@ def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] 
     """Mean duration of the stages from the onset to the detection, a bar per configuration."""
     names = results.chosen(configurations)
     means, detected = mean_stages_by_configuration(results, names), count_detected(results)
-    looks, short = choose_appearances(results, configurations), shorten_names(names)
+    looks, short = choose_appearances(results), shorten_names(names)
     with figure_style():
         figure = new_figure(8.0, 1.3 + 0.3 * len(names))
         axes = figure.subplots()

@@ -327,7 +327,7 @@ def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
 
 def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
     shown = [story.configuration for story in stories]
-    looks, names = choose_appearances(results, shown), shorten_names(shown)
+    looks, names = choose_appearances(results), shorten_names(shown)
     begin_s, end_s = _choose_limits([event for story in stories for event in story.events], _WIDTH_IN)
     steps = max(len(story.events) for story in stories)
     figure = new_figure(0.75 + (_WIDTH_IN + 0.12) * len(stories), 3 * _HEIGHT_IN + steps * STEP_IN + 1.35)
@@ -364,7 +364,7 @@ _WIDE_IN = 6.4
 def _draw_together(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
     """One column of panels for all configurations, with a mark and a label of when each knows the object."""
     shown = [story.configuration for story in stories]
-    looks, names = choose_appearances(results, shown), shorten_names(shown)
+    looks, names = choose_appearances(results), shorten_names(shown)
     first = stories[0]
     common = [event for event in first.events if event.kind not in _OF_ONE]
     known = {story.configuration: _find_known(story) for story in stories}

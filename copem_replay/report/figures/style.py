@@ -1,7 +1,7 @@
 """Style of figures: one colour, dash, width and marker per configuration in every figure; notes, numbers, files, rows.
 
-Colours come from `core/colours.py`, for paper and for a dark page. Dashes distinguish configurations in grey, too, and
-markers the variants of a family. Lines get thinner from one configuration to the next, so that coinciding curves look
+Colours, markers and dashes come from `core/colours.py`, for paper and for a dark page. Markers and dashes distinguish
+configurations in grey, too. Lines get thinner from one configuration to the next, so that coinciding curves look
 like stripes. The ground truth is a grey line of a pixel.
 """
 
@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import Rgb, configuration_colours, group_families
+from copem_replay.core.colours import Rgb, configuration_signs
 from copem_replay.core.errors import InputError, count_noun
 from copem_replay.metrics.limits import (
     count_clusters,
@@ -56,7 +56,8 @@ _DASHES: tuple[Any, ...] = (
     (6, 1.2, 1.2, 1.2, 1.2, 1.2),
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-_WIDEST_PT, _THINNEST_PT = 4.4, 1.5
+_WIDEST_PT, _THINNER_PT, _THINNEST_PT = 4.4, 0.4, 1.5
+"""Width of the line of the first configuration, how much thinner the next is, and the least."""
 _PALE = 0.4
 """Share of a colour in its pale version: clearly paler, but still that colour."""
 _TRUTH_PT = 0.75
@@ -114,22 +115,18 @@ class Appearance:
         return drawn
 
 
-def choose_appearances(results: Results, selected: Sequence[str] | None = None) -> dict[str, Appearance]:
-    """The appearance of each configuration of results. `selected`: which have colours, if they are too many."""
-    names = tuple(dict.fromkeys([*results.experiment.configurations, *(selected or ())]))
-    truths = find_truths(results)
-    light, dark = (
-        configuration_colours(names, truths=truths, selected=selected, theme=theme) for theme in ("light", "dark")
-    )
-    variant = {name: k for family in group_families(names).values() for k, name in enumerate(family)}
+def choose_appearances(results: Results) -> dict[str, Appearance]:
+    """The appearance of each configuration of results, by its place in the experiment."""
+    names, truths = tuple(results.experiment.configurations), find_truths(results)
+    light, dark = (configuration_signs(names, truths, theme) for theme in ("light", "dark"))
     result = {}
     for k, name in enumerate(names):
-        width = _WIDEST_PT + (_THINNEST_PT - _WIDEST_PT) * k / max(len(names) - 1, 1)
+        width = max(_WIDEST_PT - _THINNER_PT * k, _THINNEST_PT)
         result[name] = Appearance(
-            _scale_channels(light[name]),
-            _scale_channels(dark[name]),
-            () if name in truths else _DASHES[k % len(_DASHES)],
-            _MARKERS[variant[name] % len(_MARKERS)],
+            _scale_channels(light[name].colour),
+            _scale_channels(dark[name].colour),
+            () if name in truths else _DASHES[light[name].shape],
+            _MARKERS[light[name].shape],
             _TRUTH_PT if name in truths else width,
         )
     return result

@@ -66,7 +66,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     asked, names = names, _find_differing(sweep, names)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
-    looks = choose_appearances(results, configurations)
+    looks = choose_appearances(results)
     with figure_style():
         figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
         panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)

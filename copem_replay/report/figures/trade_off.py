@@ -63,7 +63,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
     sooner_s = {alone: 0.0} | dict(zip(compared["configuration"], -compared["difference"].astype(float), strict=True))
     share = 100 * results.summary.set_index("configuration")[SHARE].astype(float)
     names = [name for name in names if np.isfinite(sooner_s.get(name, np.nan)) and np.isfinite(share[name])]
-    looks, short = choose_appearances(results, configurations), shorten_names(names)
+    looks, short = choose_appearances(results), shorten_names(names)
     lines = {name: _sweep_existence(results, name) for name in names}
     with figure_style():
         figure = new_figure(_WIDE_IN, _HIGH_IN + 0.06 * max(len(names) - 8, 0))
