@@ -177,7 +177,10 @@ class TestFalsePositives:
         assert set(marks) == set(known.index)
         for name, place in marks.items():
             assert place == pytest.approx(tuple(known.loc[name]))
-        assert sorted(text.get_text() for text in legend.get_texts()) == sorted(known.index)
+        numbered = [f"{k} {name}" for k, name in enumerate(known.index, start=1)]
+        assert [text.get_text() for text in legend.get_texts()] == numbered
+        beside = [number for text in axes.texts for number in text.get_text().split(", ")]
+        assert sorted(beside, key=int) == [str(k + 1) for k in range(len(known))], "each beside a mark"
 
     def test_of_ideal_fusion_alone_there_is_none(self, results: Results, many: Results) -> None:
         assert FIGURES["false_positives"].missing(results, Selection()) == ""
@@ -189,8 +192,12 @@ class TestEighteen:
         every = tuple(many.experiment.configurations)
         assert len(every) == 19
         figure = curves_figure(many)
-        shown = [text.get_text().strip() for text in figure.axes[0].texts]
-        assert len(shown) <= 12
+        titles = [axes.get_title(loc="left") for axes in figure.axes]
+        shown = [name for name in every if name == "c00" or name in titles]
+        assert len(shown) == 12
+        for axes, name in zip(figure.axes, titles[:11], strict=False):
+            assert {"c00", name} <= {line.get_label() for line in axes.get_lines()}, "the baseline in each panel"
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["c00, in each panel"]
         left = [name for name in every if name not in shown]
         assert (
             f"{len(shown)} of 19 configurations, from the soonest to the latest; not drawn: {', '.join(left)}."

@@ -95,7 +95,7 @@ def test_words_of_views_are_read_in_both_themes(city: Made) -> None:
 
 
 def test_words_of_lanes_are_read_in_both_themes(city: Made) -> None:
-    """White up to an intensity of 0.6, else black, on 200 of 255 of the colour, the rest ground: as the viewer draws."""
+    """White up to an intensity of 0.6, else black, on 200 of 255 of the colour, the rest ground, as the viewer does."""
     drawn = set()
     for entity, batch in batches(city.path):
         if entity.startswith("/lanes/") and "StateConfiguration:values" in batch.schema.names:

@@ -1,5 +1,7 @@
 """Figure of curves: share of objects not yet known over the time since the onset, with 95 % bands, by configuration.
 
+More than six curves have a panel each, with the baseline in every one.
+
 The curves are what cumulative incidences of detection (Aalen–Johansen, departure competing: `metrics/survival.py`)
 leave of 100 %: objects that are never detected keep them above 0.
 
@@ -10,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +35,7 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
 )
+from copem_replay.results.compare.labels import find_baseline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,8 +48,10 @@ if TYPE_CHECKING:
 
 _NEARLY = 0.005
 """The axis ends where each curve is within this of its last value: what follows could not be seen."""
-MOST_BANDS = 6
-"""Most curves with bands: more bands hide each other."""
+TOGETHER = 6
+"""Most curves in one panel: more hide each other."""
+_COLUMNS, _PANEL_IN = 3, 1.45
+"""Panels beside each other, and the height of one."""
 _EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}
 _INSTANTS = 600
 """Most instants of a band, about one per pixel: it keeps the SVG small."""
@@ -74,16 +79,21 @@ class DetectionCurve:
 def curves_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """Share not yet known over the time since the onset, of up to twelve configurations that differ.
 
-    With 95 % bands for up to `MOST_BANDS` configurations, and with exact curves if the results have them.
+    Up to `TOGETHER` in one panel with 95 % bands; more in a panel each, with the baseline in all of them, without
+    bands. With exact curves if the results have them.
     """
     chosen = results.chosen(configurations)
     names = find_differing(results, chosen)
-    over, curves = build_curves(results, names, bands=len(names) <= MOST_BANDS)
+    over, curves = build_curves(results, names, bands=len(names) <= TOGETHER)
     counted = None if results.exact is None else results.counted(results.exact)
     weigh = results.experiment.measure.weigh
     exact = {} if counted is None else {name: exact_curve(counted, name, weigh) for name in names}
     with figure_style():
-        figure = _draw_curves(curves, exact, choose_appearances(results))
+        looks, limits_s = choose_appearances(results), choose_time_limits([*curves.values(), *exact.values()])
+        if len(names) <= TOGETHER:
+            figure = _draw_together(curves, exact, looks, limits_s)
+        else:
+            figure = _draw_apart(curves, exact, looks, limits_s, find_baseline(results.facts, names).name)
         _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
         return figure
 
@@ -135,22 +145,59 @@ def exact_curve(exact: pd.DataFrame, name: str, weigh: str = OBJECTS) -> Detecti
     return DetectionCurve(times_s, np.cumsum(mass) / max(rows.groupby(["log", "object_id", "episode"]).ngroups, 1))
 
 
-def _draw_curves(
-    curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance]
-) -> Figure:
-    short = shorten_names(list(curves))
-    begin_s, end_s = choose_time_limits([*curves.values(), *exact.values()])
-    figure = new_figure(8.0, 4.5)
-    axes = figure.subplots()
+def _draw_apart(
+    curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance],
+    limits_s: tuple[float, float], baseline: str,
+) -> Figure:  # fmt: skip
+    """A panel per configuration but the baseline, which is in all of them."""
+    short, others = shorten_names(list(curves)), [name for name in curves if name != baseline]
+    lines = math.ceil(len(others) / _COLUMNS)
+    figure = new_figure(8.0, 0.8 + _PANEL_IN * lines)
+    panels = figure.subplots(lines, _COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
+    for axes, name in zip(panels, others, strict=False):
+        shown = [{key: of[key] for key in (baseline, name) if key in of} for of in (curves, exact)]
+        thin = {key: replace(looks[key], width_pt=2.6 if key == baseline else 1.5) for key in shown[0]}
+        _draw_lines(axes, shown[0], shown[1], looks | thin, limits_s)
+        axes.set_title(short[name], loc="left")
+    for axes in panels[len(others) :]:
+        axes.set_axis_off()
+    for axes in panels[max(len(others) - _COLUMNS, 0) : len(others)]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("Time since the onset (s)")
+    for axes in panels[::_COLUMNS]:
+        axes.set_ylabel("Not yet known")
+    drawn = [line for line in panels[0].get_lines() if line.get_label() == baseline]
+    figure.legend(drawn, [f"{short[baseline]}, in each panel"], loc="outside upper right", handlelength=3.2)
+    return figure
+
+
+def _draw_lines(
+    axes: Axes, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance],
+    limits_s: tuple[float, float],
+) -> None:  # fmt: skip
     numbers = {name: k for k, name in enumerate(looks)}
     for name, curve in curves.items():
         with mark_configuration(numbers[name], axes):
-            _draw_band(axes, curve, name, looks[name], begin_s, end_s)
-            _draw_step(axes, curve, begin_s, end_s, label=name, zorder=2.2, **looks[name].line())
+            _draw_band(axes, curve, name, looks[name], *limits_s)
+            _draw_step(axes, curve, *limits_s, label=name, zorder=2.2, **looks[name].line())
     for name, curve in exact.items():
         with mark_configuration(numbers[name], axes):
-            _draw_step(axes, curve, begin_s, end_s, label="exact", zorder=3, **_EXACT)
-    _set_up_axes(axes, begin_s, end_s)
+            _draw_step(axes, curve, *limits_s, label="exact", zorder=3, **_EXACT)
+    axes.set_xlim(*limits_s)
+    axes.set_ylim(-0.02, 1.03)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
+
+
+def _draw_together(
+    curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance],
+    limits_s: tuple[float, float],
+) -> Figure:  # fmt: skip
+    """All curves in one panel, with their names at their ends."""
+    short, end_s = shorten_names(list(curves)), limits_s[1]
+    figure = new_figure(8.0, 4.5)
+    axes = figure.subplots()
+    numbers = {name: k for k, name in enumerate(looks)}
+    _draw_lines(axes, curves, exact, looks, limits_s)
     places = spread_labels([1 - _evaluate_share(curve, end_s) for curve in curves.values()])
     for (name, curve), place in zip(curves.items(), places, strict=True):
         with mark_configuration(numbers[name], axes):
@@ -182,12 +229,6 @@ def _draw_label(axes: Axes, name: str, look: Appearance, end: tuple[float, float
     beside = end[0] + 0.03 * (end_s - begin_s)
     axes.plot([end[0], beside], [end[1], place], color=look.colour, linewidth=0.8, clip_on=False)
     axes.text(beside, place, f" {name}", va="center", ha="left", fontsize=8.5, clip_on=False)
-
-
-def _set_up_axes(axes: Axes, begin_s: float, end_s: float) -> None:
-    axes.set_xlim(begin_s, end_s)
-    axes.set_ylim(-0.02, 1.03)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
 
 
 def _draw_band(axes: Axes, curve: DetectionCurve, name: str, look: Appearance, begin_s: float, end_s: float) -> None:
@@ -238,8 +279,8 @@ def _add_caption(
         bands = f"No bands: {explain_no_intervals(results)}"
     elif over == NOTHING_DRAWN:
         bands = "No bands: nothing drawn, every run is the same"
-    elif len(names) > MOST_BANDS:
-        bands = f"No bands with more than {MOST_BANDS} curves; choose some with --configurations"
+    elif len(names) > TOGETHER:
+        bands = f"No bands with more than {TOGETHER} curves; choose some with --configurations"
     else:
         bands = f"Bands: 95 %, over {describe_over(results)}"
     end_s = figure.axes[0].get_xlim()[1]

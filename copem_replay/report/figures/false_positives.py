@@ -20,6 +20,7 @@ from copem_replay.report.figures.style import (
     find_contenders,
     mark_configuration,
     new_figure,
+    number_marks,
     shorten_names,
 )
 
@@ -82,7 +83,7 @@ def false_positives_figure(results: Results, *, configurations: Sequence[str] | 
                 f"Not drawn, for they have no such metrics or are the ground truth: {', '.join(left)}" if left else "",
             ],
         )
-        figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")
+        number_marks(figure, axes, [short[name] for name in names], _MARK_PT)
     return figure
 
 

@@ -116,6 +116,8 @@ _GROUND = (0.992, 0.99, 0.985)
 """Ground of the panels, no grey: it stays light on a dark page, as the colours of paths need it."""
 _SHADES = 24
 """Shades of the scale: so few are shapes in an SVG, more would be a picture."""
+_AT_0_S = 0.55
+"""Place of 0 s on the scale, which ends at 0: lighter colours have less than 3:1 to the ground."""
 NEVER_FROM = 0.5
 """Share of runs from which on an object counts as never known."""
 
@@ -208,7 +210,7 @@ def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> 
     """Draw the paths of the episodes of one configuration, the latest on top. Returns what has the colours."""
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import ListedColormap, Normalize
 
     before, unknown, after, times_s, never = [], [], [], [], []
     for row in rows.sort_values("unknown_s", kind="stable").itertuples(index=False):
@@ -222,7 +224,7 @@ def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> 
             never.append(at_m[(time_s <= row.ended_s) & ~np.isnan(at_m[:, 0])][-1:])
     axes.add_collection(LineCollection(before, colors="0.72", linewidths=1.0, zorder=1.6))
     coloured: dict[str, Any] = {
-        "cmap": colormaps["cividis_r"].resampled(_SHADES),
+        "cmap": ListedColormap(colormaps["viridis"](np.linspace(_AT_0_S, 0.0, _SHADES))),
         "norm": Normalize(0, most_s),
         "array": np.array(times_s),
     }

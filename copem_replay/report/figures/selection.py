@@ -15,7 +15,8 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.onset import COUNTS_BY
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.report.figures.style import shorten_names, sort_soonest_first
+from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
+from copem_replay.results.compare.labels import find_baseline
 from copem_replay.results.shown_objects import choose_shown_objects, measure_apart
 
 if TYPE_CHECKING:
@@ -136,18 +137,21 @@ def _find_most_telling(results: Results, of_run: pd.DataFrame) -> tuple[str, str
 def find_differing(results: Results, names: Sequence[str], most: int = MOST_LINES) -> tuple[str, ...]:
     """Up to `most` configurations in their order: all, or the first ones of those with equal times to detection.
 
-    If these are still too many, they are picked evenly from the soonest to the latest.
+    If these are still too many, they are picked evenly from the soonest to the latest. The baseline is always among
+    them.
     """
     if len(names) <= most:
         return tuple(names)
+    baseline = find_baseline(results.facts, names).name
     digests = {name: blake2b() for name in names}
     for times_s in pivot_by_run(results, "time_to_detection_s"):
         for name, so_far in digests.items():
             so_far.update(times_s[name].round(6).to_numpy(dtype=float).tobytes())
     first: dict[bytes, str] = {}
-    for name, digest in digests.items():
-        first.setdefault(digest.digest(), name)
-    kept = pick_evenly(sort_soonest_first(results, list(first.values())), most)
+    for name in (baseline, *digests):
+        first.setdefault(digests[name].digest(), name)
+    others = [name for name in first.values() if name != baseline]
+    kept = {baseline, *pick_evenly(sort_soonest_first(results, others), most - 1)}
     return tuple(name for name in names if name in kept)
 
 

@@ -219,6 +219,58 @@ def add_note(figure: Figure, sentences: Sequence[str]) -> float:
     return below_in
 
 
+_NUMBER_PT = 7.5
+"""Size of the number beside a mark (points), whose figures are about half as wide."""
+_BESIDE = ((1, 0), (1, 1), (0, 1), (-1, 0), (0, -1), (-1, 1), (1, -1), (-1, -1))
+"""Places of a number around its mark, the best first: right, above and below."""
+
+
+def number_marks(figure: Figure, axes: Axes, names: Sequence[str], mark_pt: float) -> None:
+    """Add the legend of a figure with a mark per name, and their numbers in it and beside the marks.
+
+    Marks that touch have their numbers together. Numbers stand where they cover neither each other nor a mark, if
+    there is such a place next to their mark.
+    """
+    legend = figure.legend(
+        axes.collections, [f"{k} {name}" for k, name in enumerate(names, start=1)], loc="outside right upper"
+    )
+    for handle in legend.legend_handles:
+        handle.set_sizes([mark_pt**2])  # type: ignore[union-attr]
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)  # places of marks in points depend on it
+    at = [tuple(np.asarray(mark.get_offsets())[0].tolist()) for mark in axes.collections]
+    places = [axes.transData.transform(place) * 72 / figure.dpi for place in at]
+    groups: list[list[int]] = []
+    for k, place in enumerate(places):
+        near = (group for group in groups if any(math.dist(places[other], place) < mark_pt for other in group))
+        group = next(near, None)
+        groups.append([k]) if group is None else group.append(k)
+    left, bottom, right, _ = (72 / figure.dpi * edge for edge in axes.get_window_extent().extents)
+    taken = [((left + right) / 2, bottom, right - left, 1.0), *((*place, mark_pt, mark_pt) for place in places)]
+    for group in groups:
+        text = ", ".join(str(k + 1) for k in group)
+        wide, high = 0.58 * _NUMBER_PT * len(text), _NUMBER_PT
+        spots = [
+            (places[k][0] + x * (wide + mark_pt + 3) / 2, places[k][1] + y * (high + mark_pt + 1) / 2, wide, high)
+            for x, y in _BESIDE
+            for k in group
+        ]
+        spot = min(spots, key=lambda one: sum(_overlap(one, other) for other in taken))
+        taken.append(spot)
+        axes.annotate(
+            text, at[group[0]], xytext=tuple(np.subtract(spot[:2], places[group[0]])),
+            textcoords="offset points", ha="center", va="center", fontsize=_NUMBER_PT, color=INK, annotation_clip=False,
+        )  # fmt: skip
+
+
+def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    """Area common to two boxes, each by its middle, width and height."""
+    wide = min((one[2] + other[2]) / 2 - abs(one[0] - other[0]), one[2], other[2])
+    high = min((one[3] + other[3]) / 2 - abs(one[1] - other[1]), one[3], other[3])
+    return max(wide, 0.0) * max(high, 0.0)
+
+
 _NOTE = "note"
 """What tells the text of a note from others of a figure."""
 

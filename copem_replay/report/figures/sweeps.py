@@ -25,6 +25,7 @@ from copem_replay.report.figures.style import (
     new_figure,
     shorten_names,
 )
+from copem_replay.results.compare.labels import find_baseline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +64,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     kinds = list(dict.fromkeys(sweep["sweep"]))
     if not kinds:
         raise InputError(f"{results.place}/sweep.csv: expected rows of {', '.join(names)}, found none")
-    asked, names = names, _find_differing(sweep, names)
+    asked, names = names, _find_differing(sweep, names, find_baseline(results.facts, names).name)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
     looks = choose_appearances(results)
@@ -90,10 +91,13 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     return figure
 
 
-def _find_differing(sweep: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
-    """Up to `MOST_LINES` configurations, evenly from the soonest to the latest by the mean over all values."""
+def _find_differing(sweep: pd.DataFrame, names: Sequence[str], baseline: str) -> tuple[str, ...]:
+    """Up to `MOST_LINES` configurations: the baseline, and evenly from the soonest to the latest by the mean over all
+    values.
+    """
     mean_s = sweep["ttd_rmst_s"].groupby(sweep["configuration"]).mean() if "ttd_rmst_s" in sweep else pd.Series()
-    picked = pick_evenly(sorted(names, key=lambda name: float(mean_s.get(name, 0.0))), MOST_LINES)
+    others = sorted((name for name in names if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
+    picked = {baseline, *pick_evenly(others, MOST_LINES - 1)}
     return tuple(name for name in names if name in picked)
 
 

@@ -27,6 +27,7 @@ from copem_replay.report.figures.style import (
     find_contenders,
     mark_configuration,
     new_figure,
+    number_marks,
     shorten_names,
 )
 from copem_replay.results.compare import compare_folders
@@ -92,7 +93,7 @@ def trade_off_figure(results: Results, *, configurations: Sequence[str] | None =
                 "Lines: only entries of more and more existence" if swept else "",
             ],
         )
-        figure.legend(axes.collections, [short[name] for name in names], loc="outside right upper")
+        number_marks(figure, axes, [short[name] for name in names], _MARK_PT)
     return figure
 
 
