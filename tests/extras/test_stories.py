@@ -64,7 +64,7 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
 def test_links_lead_to_the_stories_that_a_page_has(hidden: Path) -> None:
     """The pedestrian has one; the lorry's name stays a name."""
     [_, story] = story_parts(load_study(hidden))
-    links = [link_story(words, "drive", name) for words, name in (("pedestrian 3", "3"), ("<car> 9", "9"))]
+    links = [link_story("drive", name, words) for words, name in (("pedestrian 3", "3"), ("<car> 9", "9"))]
     body = drop_dead_links(join_html([*links, story]))
     assert body.startswith('<a href="#story-drive-3">pedestrian 3</a>&lt;car&gt; 9<div ')
     assert body.count(' id="story-drive-3"') == 1

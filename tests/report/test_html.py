@@ -382,9 +382,9 @@ class TestNeverDetected:
     def test_by_name_and_in_how_many_runs(self, tmp_path: Path) -> None:
         found = Page(build_page(load_study(replayed(tmp_path, changed()))))
         assert found.rows["never"] == [
-            ["log", "object", "class", "never in", "by", "looked at for (s)", "until"],
-            ["drive", "2", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
-            ["drive", "3", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended"],
+            ["log", "object", "class", "never in", "by", "looked at for (s)", "until", "look at it"],
+            ["drive", "2", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended", "story"],
+            ["drive", "3", "pedestrian", "6 runs (all)", "never", "4.5", "the log ended", "story"],
         ]
 
     def test_without_a_draw(self, tmp_path: Path) -> None:

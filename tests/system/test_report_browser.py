@@ -155,6 +155,42 @@ def test_on_a_phone_only_tables_and_figures_scroll_sideways(opened: Browser) -> 
     assert wide > 0, "a table wider than the page is there to be scrolled"
 
 
+BROKEN = """
+const broken = [];
+for (const cell of document.querySelectorAll("th, td")) {
+  const texts = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+  while (texts.nextNode()) {
+    const text = texts.currentNode, range = document.createRange();
+    for (const word of text.data.matchAll(/[\\p{L}\\p{N}]+/gu)) {
+      range.setStart(text, word.index);
+      range.setEnd(text, word.index + word[0].length);
+      if (new Set([...range.getClientRects()].map((box) => Math.round(box.top))).size > 1) broken.push(word[0]);
+    }
+  }
+}
+return broken;
+"""
+UNNAMED = """
+return [...document.querySelectorAll("svg, canvas, img, [role=img]")].filter((one) =>
+  !one.closest("[aria-hidden=true]") && !(one.getAttribute("aria-label") || "").trim()).map((one) => one.outerHTML);
+"""
+
+
+def test_on_a_phone_no_word_of_a_table_is_broken(opened: Browser) -> None:
+    """But for digests, which no line holds."""
+    opened.narrow(390)
+    assert [word for word in opened.run(BROKEN) if len(word) < 40] == []
+    cut = (
+        "return [...document.querySelectorAll('th, td')].filter((one) => one.scrollWidth > one.clientWidth + 1).length"
+    )
+    assert opened.run(cut) == 0
+
+
+def test_every_graphic_has_a_name_or_is_an_ornament(opened: Browser) -> None:
+    assert opened.run(UNNAMED) == []
+    assert opened.run("return document.querySelectorAll('svg').length") > 20
+
+
 def test_on_a_phone_the_name_stays_and_times_come_first(opened: Browser) -> None:
     opened.narrow(390)
     first, column = opened.run(

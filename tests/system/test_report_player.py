@@ -110,11 +110,31 @@ def test_the_list_says_when_each_was_known_and_chooses(played: Browser) -> None:
     rows = (
         'return [...document.querySelectorAll("#player tbody tr")].map((r) => [...r.cells].map((c) => c.textContent))'
     )
-    assert played.run(rows) == [["2 pedestrian", "0.50 s", "never"], ["3 pedestrian", "0.50 s", "never"]]
+    assert played.run(rows) == [[who, "0.50 s", "never", "story"] for who in ("2 pedestrian", "3 pedestrian")]
     played.run('document.querySelectorAll("#player tbody button")[1].click()')
     assert played.run('return document.getElementById("player").dataset.object') == "3"
     pressed = 'return [...document.querySelectorAll("#player tbody button")].map((b) => b.ariaPressed)'
     assert played.run(pressed) == ["false", "true"]
+
+
+def test_tables_lead_to_story_and_player_and_say_the_command(played: Browser) -> None:
+    """Of the second object: from the table of those never detected, from its story, and from the player's own list."""
+    cells = played.run(
+        "return [...document.querySelectorAll('#never tbody tr:nth-child(2) td')].map((one) => one.innerText)"
+    )
+    assert (cells[0], cells[-1]) == ("3", "story player copem-replay view FOLDER --object 3")
+    played.run("document.querySelector('#never tr:nth-child(2) [data-played]').click()")
+    at = "return [location.hash, document.querySelector('#player').dataset.object]"
+    assert played.run(at) == ["#player", "3"]
+    assert played.run("return document.querySelector('.command').textContent") == "copem-replay view FOLDER --object 3"
+    for link in ("#never tr:nth-child(2) a", "#player tbody tr:nth-child(2) a"):
+        shown = f"""document.querySelector({link!r}).click();
+            return document.querySelector(location.hash).querySelector("h3").textContent"""
+        assert played.run(shown).startswith("pedestrian 3: ")
+        played.run("document.querySelector('.told:has(h3) [data-played=\"2\"]').click()")
+        assert played.run(at) == ["#player", "2"]
+    played.run("document.querySelector('#never th:nth-child(2) .sort').click()")
+    assert played.run("return document.querySelectorAll('#never [data-played]').length") == 2, "sorting keeps links"
 
 
 def test_keys_move_in_time_and_between_objects(played: Browser) -> None:

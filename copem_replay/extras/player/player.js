@@ -229,8 +229,11 @@
     slider.setAttribute("aria-valuetext", clock.textContent);
     player.dataset.frame = String(frame);
     player.dataset.object = data.objects[object][0];
+    const id = data.objects[object][0];
+    find(".command").textContent = data.view.replace("OBJECT", /^[\w@%+=:,./-]+$/.test(id) ? id : `'${id}'`);
   };
 
+  const stories = [...document.querySelectorAll("[data-story]")].filter((one) => one.dataset.log === data.log);
   const fill = () => {
     list.replaceChildren();
     for (const [k] of data.measured) {
@@ -243,6 +246,12 @@
       head.append(name);
       row.append(head);
       for (const panel of panels) row.insertCell().textContent = seconds(shown(panel), k);
+      const story = stories.find((one) => one.dataset.story === data.objects[k][0]);
+      if (!story) continue;
+      const link = document.createElement("a");
+      link.href = `#${story.id}`;
+      link.textContent = "story";
+      row.insertCell().append(link);
     }
   };
   const go = (to) => {
@@ -308,6 +317,16 @@
   for (const panel of panels) panel.choose.addEventListener("change", () => (fill(), draw()));
   new ResizeObserver(draw).observe(player);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  // Links of the page, also below, to objects that are played here; other ones go.
+  const played = (link) =>
+    link.dataset.log === data.log && data.measured.find(([k]) => data.objects[k][0] === link.dataset.played);
+  addEventListener("click", (event) => {
+    const link = event.target.closest?.("a[data-played]");
+    if (link) choose(played(link)[0]);
+  });
+  addEventListener("DOMContentLoaded", () => {
+    for (const link of document.querySelectorAll("a[data-played]")) if (!played(link)) link.remove();
+  });
   fill();
   begin();
 })();

@@ -162,6 +162,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
     return {
         "log": choice.log,
         "run": choice.run,
+        "view": study.view_command(choice.log, "OBJECT"),
         "from": float(grid.instants_s[0]),
         "step": round(float(np.diff(grid.instants_s[:2]).sum()), 3) or STEP_S,
         "frames": len(grid.instants_s),
@@ -320,7 +321,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
     slider = make_tag(
         "input", type="range", min="0", max=last, value="0", step="1", aria_label="instant", class_="moment"
     )
-    head = make_tag("tr", *(make_tag("th", word, scope="col") for word in ("object", *"AB"[: len(panels)])))
+    head = make_tag("tr", *(make_tag("th", word, scope="col") for word in ("object", *"AB"[: len(panels)], "more")))
     table = make_tag("table", make_tag("caption", "Known after"), make_tag("thead", head), make_tag("tbody"))
     listed = make_tag("div", table, class_="objects", tabindex="0", role="region", aria_label="Objects")
     controls = make_tag(
@@ -334,6 +335,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
             make_tag("p", says, " ", make_tag("span", _KEYS, class_="screen")),
             make_tag(
                 "div", make_tag("div", *panels, class_="panels"), controls, _write_signs(), listed,
+                make_tag("p", make_tag("code", class_="command"), class_="below"),
                 id_="player", tabindex="0", role="group", aria_label="Player of a run",
             ),
             make_tag("script", Html(written), type="application/json", id_="played"),

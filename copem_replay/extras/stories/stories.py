@@ -21,7 +21,7 @@ from copem_replay.extras.stories.story_pictures import draw_story
 from copem_replay.extras.why.report import read_why, why_late
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.report.figures.paths import Drive, find_latest_log, read_drive
-from copem_replay.report.html.markup import Html, make_tag, story_anchor
+from copem_replay.report.html.markup import Html, link_player, make_tag, story_id
 from copem_replay.report.html.study import NO_RECORDING, ReportData
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import choose_shown_objects
@@ -49,7 +49,6 @@ def story_parts(study: ReportData) -> list[Html]:
     chosen, too_short = choose_stories(drive, table, rows)
     told = {name: first_episodes(rows[rows["object_id"] == name]) for name in chosen}
     spans, lost = find_spans(study, drive, run, told), count_lost_lists(study, drive, run, told)
-    several = len(study.results.provenance.logs) > 1
     said = (
         f"Run {run} of {log}: the objects that copem-replay view shows. First are those that configurations know at "
         "the most different times, near the way of the ego."
@@ -60,7 +59,7 @@ def story_parts(study: ReportData) -> list[Html]:
     parts = [make_tag("p", said + short)]
     for name, of in told.items():
         story = ObjectStory(study, drive, of, spans[name], None if lost is None else lost.get(name, {}))
-        parts.append(_story_element(story, log if several else None))
+        parts.append(_story_element(story))
     return parts
 
 
@@ -100,12 +99,11 @@ def _name_difference(story: ObjectStory) -> str:
     return f"known with {first['configuration']} {format_seconds(apart_s)} before {last['configuration']}"
 
 
-def _story_element(story: ObjectStory, log: str | None) -> Html:
+def _story_element(story: ObjectStory) -> Html:
     hider, said = story.hider, explain_story(story)
     title = make_tag("h3", f"{story.name}: {_name_difference(story)}")
-    shown = log is None or log in story.study.results.provenance.run_shown
-    command = f"copem-replay view FOLDER --object {story.object_id}" + (f" --log {log}" if log else "")
-    beside = [" ", make_tag("code", command)] if shown and story.study.results.provenance.run_shown else []
+    log, command = story.drive.log, story.study.view_command(story.drive.log, story.object_id)
+    beside = [" ", link_player(log, story.object_id), *([" ", make_tag("code", command)] if command else [])]
     figure = make_tag(
         "div", draw_story(story, hider, said), class_="scroll", tabindex="0", role="region", aria_label=story.name
     )
@@ -115,5 +113,7 @@ def _story_element(story: ObjectStory, log: str | None) -> Html:
     lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
     causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
     causes = [make_tag("p", helps), *causes] if helps else causes
-    told = title, make_tag("p", said, *beside), *causes, figure
-    return make_tag("div", *told, class_="told", id_=story_anchor(story.drive.log, story.object_id))
+    return make_tag(
+        "div", title, make_tag("p", said, *beside), *causes, figure, class_="told", id_=story_id(log, story.object_id),
+        data_log=log, data_story=story.object_id,
+    )  # fmt: skip

@@ -82,9 +82,8 @@ def _draw_plans(story: ObjectStory, hider: SightSpan | None) -> Iterator[Html]:
         view = _View(box[0], box[1], _PLAN_W / box[2], left)
         yield make_tag("text", title, x=f"{left}", y="12", class_="title")
         frame = {"x": f"{left}", "y": f"{_TOP}", "width": f"{_PLAN_W}", "height": f"{_PLAN_H}"}
-        yield make_tag(
-            "svg", *_draw_plan(story, world, view, row, hider), viewBox=f"{left} {_TOP} {_PLAN_W} {_PLAN_H}", **frame
-        )
+        plan, box_px = _draw_plan(story, world, view, row, hider), f"{left} {_TOP} {_PLAN_W} {_PLAN_H}"
+        yield make_tag("svg", *plan, viewBox=box_px, aria_hidden="true", **frame)
         yield make_tag("rect", **frame, fill="none", stroke="#8c8c8c")
 
 

@@ -136,7 +136,7 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
         words = f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share}), {describe_cause(str(row['cause']))}"
         example = f"copem-replay view FOLDER --object {row['example']} --log {row['log']}"
         words += where + describe_structure(float(row["structural_share"]))
-        name = link_story(f"{row['example_class']} {row['example']}", str(row["log"]), str(row["example"]))
+        name = link_story(str(row["log"]), str(row["example"]), f"{row['example_class']} {row['example']}")
         lines.append(make_tag("span", f"{words}; such as ", name, " ", make_tag("code", example)))
     rest = len(of) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []

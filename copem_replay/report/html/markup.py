@@ -37,24 +37,6 @@ def join_html(parts: Iterable[str], between: str = "") -> Html:
     return Html(escape_text(between).join(map(escape_text, parts)))
 
 
-def story_anchor(log: str, object_id: str) -> str:
-    """The id of an object's story on a page, for links from sentences that name it."""
-    return "story-" + quote(f"{log}-{object_id}", safe="").replace("%", "_")
-
-
-def link_story(words: str, log: str, object_id: str) -> Html:
-    """Words as a link to the story of an object. A page without this story has the words alone (`drop_dead_links`)."""
-    return make_tag("a", words, href=f"#{story_anchor(log, object_id)}")
-
-
-_STORY_LINK = re.compile(r'<a href="#(story-[^"]*)">(.*?)</a>')
-
-
-def drop_dead_links(body: Html) -> Html:
-    """A body in which links to stories that it does not have are plain words."""
-    return Html(_STORY_LINK.sub(lambda link: link[0] if f' id="{link[1]}"' in body else link[2], body))
-
-
 def allow_breaks(name: str) -> Html:
     """A name with possible line breaks after underscores, colons and dots that are no decimal points."""
     return Html(re.sub(r"([_:](?=\w)|\.(?=[a-z]))", r"\1<wbr>", escape_text(name)))
@@ -67,6 +49,41 @@ def make_table(head: Sequence[str], rows: Iterable[str], *, caption: str = "", i
     table = make_tag("table", *above, make_tag("thead", first), make_tag("tbody", *rows), id_=id_)
     # Without a tab index the keyboard cannot scroll it.
     return make_tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=caption or "table")
+
+
+# Links between places where one object is shown; a page drops those to what it lacks.
+
+
+def story_id(log: str, object_id: str) -> str:
+    """The id of the element that tells an object's story."""
+    return "story-" + quote(f"{log}-{object_id}", safe="").replace("%", "_")
+
+
+def link_story(log: str, object_id: str, words: str | None = None) -> Html:
+    """Words as a link to an object's story; without words it is one of its own. For pages without this story see
+    `drop_dead_links`.
+    """
+    href = f"#{story_id(log, object_id)}"
+    return make_tag("a", "story", class_="to", href=href) if words is None else make_tag("a", words, href=href)
+
+
+_STORY_LINK = re.compile(r'<a( class="to")? href="#(story-[^"]*)">(.*?)</a>')
+
+
+def drop_dead_links(body: Html) -> Html:
+    """A body without links to stories that it does not have; their words stay."""
+    return Html(_STORY_LINK.sub(lambda to: to[0] if f' id="{to[2]}"' in body else "" if to[1] else to[3], body))
+
+
+def link_player(log: str, object_id: str) -> Html:
+    """A link to an object in the player, whose script takes out those to objects that it does not play."""
+    return make_tag("a", "player", class_="to", href="#player", data_log=log, data_played=object_id)
+
+
+def drop_dead_links(html: str) -> Html:
+    """A page without the links of this kind that lead nowhere."""
+    ids = set(re.findall(r' id="([^"]+)"', html))
+    return Html(re.sub(r'<a class="to" href="#([^"]+)".*?</a>', lambda link: link[0] if link[1] in ids else "", html))
 
 
 def fold_parts(title: str, *parts: str) -> Html:

@@ -136,7 +136,7 @@ def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Ite
     svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
     svg = _NOT_DRAWN.sub("", svg[svg.index("<svg ") :])  # comments repeat texts of users without escapes
     svg = _SIZE.sub(_enlarge, _IDS.sub(f"{name}-", svg), count=1)
-    svg = replace_greys(replace_colours(svg, looks))
+    svg = replace_greys(replace_colours(svg, looks)).replace("<svg ", '<svg aria-hidden="true" ', 1)
     plot = make_tag("div", Html(svg), id_=name, class_="plot", role="img", aria_label=shows)
     drawn = make_tag("div", plot, class_="scroll figure", tabindex="0", role="region", aria_label=title)
     return join_html([drawn, make_tag("div", note, class_="below note")]) if note else drawn
@@ -189,9 +189,8 @@ def build_page(study: ReportData) -> str:
         section_links((section.id, section.title) for section in sections),
         *([_configuration_key(study)] if measured and len(study.names) > 1 else []),
     )
-    return whole_page(
-        title, join_html([head, *(make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)])
-    )
+    parts = (make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)
+    return whole_page(title, drop_dead_links(join_html([head, *parts])))
 
 
 def _false_sections(study: ReportData) -> Iterator[_Section]:

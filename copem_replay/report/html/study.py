@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -72,6 +73,12 @@ class ReportData:
         """The verdicts in the folder, else of the criteria of the experiment; None: no criteria."""
         folder = self.results.folder
         return (None if folder is None else find_verdicts(folder)) or judge_own_criteria(self.results)
+
+    def view_command(self, log: str, object_id: str) -> str:
+        """The command that opens the viewer at an object; empty where the results have no recording of its log."""
+        logs = self.results.provenance.run_shown
+        of_log = f" --log {shlex.quote(log)}" if len(self.results.provenance.logs) > 1 else ""
+        return f"copem-replay view FOLDER --object {shlex.quote(object_id)}{of_log}" if log in logs else ""
 
     def of(self, name: str) -> pd.Series:
         """The row of `summary.csv` of a configuration."""

@@ -33,6 +33,8 @@ from copem_replay.report.html.markup import (
     fold_parts,
     join_html,
     line_swatch,
+    link_player,
+    link_story,
     make_list,
     make_table,
     make_tag,
@@ -328,7 +330,7 @@ def never_detected(study: ReportData) -> Html:
         f"{count_noun(things, 'object')} of the {measured} measured, missed in some run by some configuration; the "
         "most missed first. A row names all configurations that miss the object in as many runs."
     )
-    head = ["log", "object", "class", "never in", "by", "looked at for (s)", "until"]
+    head = ["log", "object", "class", "never in", "by", "looked at for (s)", "until", "look at it"]
     table = make_table(head, rows, caption="Objects never detected", id_="never")
     if len(rows) > _OPEN:
         table = make_tag("details", make_tag("summary", f"All {len(rows)} rows"), table)
@@ -402,10 +404,12 @@ def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
     by_all = len(names) == len(study.names) > 1
     by = f"all {len(names)} configurations" if by_all else ", ".join(names)
     again = f", episode {row['episode']}" if row["episode"] else ""
+    log, object_id = str(row["log"]), str(row["object_id"])
+    links, command = [link_story(log, object_id), link_player(log, object_id)], study.view_command(log, object_id)
     return make_tag(
         "tr",
         make_tag("th", str(row["log"]), scope="row"),
-        make_tag("td", f"{row['object_id']}{again}", class_="text"),
+        make_tag("td", f"{object_id}{again}", class_="text"),
         make_tag("td", str(row["object_class"]), class_="text"),
         make_tag("td", f"{count_noun(int(row['runs']), 'run') if row['missed'] == row['runs'] else row['missed']}"
             + (" (all)" if row["missed"] == row["runs"] else f" of {count_noun(int(row['runs']), 'run')}"),
@@ -413,6 +417,7 @@ def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
         make_tag("td", by, class_="text long"),
         make_tag("td", format_cell(float(row["ended_s"] - row["onset_s"]))),
         make_tag("td", EndReason(row["ended_by"]).past, class_="text"),
+        make_tag("td", join_html([*links, make_tag("code", command)] if command else links, " "), class_="text long"),
     )  # fmt: skip
 
 
