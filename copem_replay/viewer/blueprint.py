@@ -52,6 +52,8 @@ BESIDE = 4
 """Objects with lanes on one page: the lanes of seven configurations fit into a height of 720 points."""
 BESIDE_LISTS = 2
 """Objects on one page if lanes of lists are under theirs: thirteen lanes fit into a height of 720 points."""
+MASTS = 2
+"""Most units with names in a view with words below objects."""
 MANY = 4
 """More configurations than this need half of a page's height for their lanes."""
 OVERVIEW, FEW = 4, 3
@@ -143,6 +145,19 @@ class RecordingContent:
         """The units of a configuration, by name."""
         return self.experiment.units_of(self.experiment.configurations[configuration])
 
+    def named_masts(self, configuration: str, objects: Sequence[int]) -> list[str]:
+        """Units beside the ego's that have names among other words: those of a configuration that listed objects first,
+        the first objects first; without any the nearest ones.
+        """
+        told = (self.episodes[k] for k in objects)
+        first = [unit for rows in told for unit in rows.loc[rows["configuration"] == configuration, "first_unit"]]
+        units, heard = self.experiment.units, self.received(configuration)
+        known = (
+            [name for name in dict.fromkeys(of) if name in heard and units[name].on != "ego"][:MASTS]
+            for of in (first, self.named)
+        )
+        return next(filter(None, known), [])
+
     @property
     def with_map(self) -> bool:
         """Whether there is a page with a map of the world."""
@@ -233,7 +248,15 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
     pages = []
     for k, eye in zip(content.objects[:NEAR_BY], content.eyes, strict=False):
         views = [
-            world_view(content, name, title, eye, units=content.received(name), fields=True)
+            world_view(
+                content,
+                name,
+                title,
+                eye,
+                units=content.received(name),
+                fields=True,
+                named=content.named_masts(name, [k]),
+            )
             for name, title in _last_and_first(content, k)
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
@@ -322,8 +345,9 @@ def units_page(content: RecordingContent) -> rrb.Container:
     title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
     units = (*units, *(name for name in placed if name not in units))
     view = world_view(
-        content, largest, title, content.above, units=units, fields=True, named=[n for n in content.named if n in units]
-    )
+        content, largest, title, content.above, units=units, fields=True, quiet=True,
+        named=[name for name in content.named if name in units],
+    )  # fmt: skip
     return rrb.Tabs(view, name="Units")
 
 
@@ -353,9 +377,12 @@ def tracks_views(
     """
     marks = len(content.objects) == 1
     return [
-        world_view(content, name, content.title(name, mark), content.eye, units=content.received(name), marks=marks)
+        world_view(
+            content, name, content.title(name, mark), content.eye, units=content.received(name), marks=marks,
+            named=content.named_masts(name, content.objects),
+        )
         for name in configurations
-    ]
+    ]  # fmt: skip
 
 
 def count_columns(views: int) -> int:
@@ -365,11 +392,12 @@ def count_columns(views: int) -> int:
 
 def world_view(
     content: RecordingContent, configuration: str, title: str, eye: Camera, *, units: Sequence[str],
-    fields: bool = False, marks: bool = False, named: Sequence[str] = (),
+    fields: bool = False, marks: bool = False, named: Sequence[str] = (), quiet: bool = False,
 ) -> rrb.Spatial3DView:  # fmt: skip
     """A view of truth and one configuration, with `units` as points and, with `fields`, their fields of view.
 
     `marks`: with the lasting lines to the places of objects at their detection. `named`: units with visible names.
+    `quiet`: these are the only labels.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -380,8 +408,8 @@ def world_view(
     contents += [f"+ {part}/**"] if marks else [f"+ {part}/**", f"- {part}/marks/**"]
     shown = rr.Points3D.from_fields(show_labels=True)
     near = not eye.turns and eye.object_ix is not None
-    # Words of the other pictures would lie over bodies; with named units, names are the only labels.
-    contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if named or (words == WORDS) == near]
+    # Words of the other pictures would lie over bodies.
+    contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if quiet or (words == WORDS) == near]
     if eye.turns:
         on_edge = ["arrows"], ["false", configuration_part(configuration)]
         contents += [f"+ {make_entity_path(*eye.path, *entity)}" for entity in on_edge]

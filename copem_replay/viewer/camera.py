@@ -30,6 +30,8 @@ BESIDE_ASPECT = 1.7
 """Width by height of two views beside each other, at least."""
 TOGETHER_M = 60.0
 """Farthest unit that is in one picture with what it sees: from farther away people are a few pixels."""
+NEARBY_M = 100.0
+"""Extent of the ways of several objects that a standing camera holds together."""
 TURNED_RAD, DOWN_RAD = np.deg2rad((65.0, 65.0))
 """Direction of view on one object, right of the ego's heading and down."""
 ABOVE_RAD = np.deg2rad(78.0)
@@ -77,8 +79,9 @@ def camera_on_ego(
 ) -> Camera:
     """A camera from above that moves and turns with the ego, which drives to the right in the picture.
 
-    Without an ego or a carried unit to follow, the whole site is in view, its longer side across. `stories`: first and
-    last second of each shown object's axis, by index, the most telling one first. `aspect`: width by height of a view.
+    Without an ego or a carried unit to follow, the ways of the shown objects during their stories are in view, with the
+    units around them, the longer side across; without objects the whole site. `stories`: first and last second of each
+    shown object's axis, by index, the most telling one first. `aspect`: width by height of a view.
     """
     truth, on = replay.truth, find_followed(replay.scene, experiment)
     if on >= 0:
@@ -92,13 +95,30 @@ def camera_on_ego(
         path = (*EYES, "ego")
         up_rad = float(own[3]) + np.pi / 2
         return Camera(np.round(place, 1), np.zeros(3), at_m, on, path, True, up_rad, aspect)
-    units = [unit.at for unit in experiment.units.values() if unit.at is not None]
     ground_m = float(truth.z_m[0].mean()) if truth.z_m.size else 0.0
-    place = np.array([*((*at[:2], ground_m) for at in units)]).reshape(-1, 3).T
-    place = np.concatenate([np.stack([truth.x_m[0], truth.y_m[0], truth.z_m[0]]), place], axis=1)
+    ats = [(*unit.at[:2], ground_m) for unit in experiment.units.values() if unit.at is not None]
+    units, place = np.array(ats).reshape(-1, 3).T, _story_places(replay, experiment, stories)
+    if place.size:
+        units = units[:, (np.hypot(*(units[:2, :, None] - place[:2, None])) <= TOGETHER_M).any(axis=1)]
+    else:
+        place = np.stack([truth.x_m[0], truth.y_m[0], truth.z_m[0]])
+    place = np.concatenate([place, units], axis=1)
     if not place.size:
         return Camera(np.array([0.0, -8.0, 37.0]), np.zeros(3), np.zeros(3), heading_rad=np.pi / 2)
-    return camera_above(place, _longest_way_rad(place) + np.pi / 2, aspect)
+    middle = (place.min(axis=1) + place.max(axis=1))[:, None] / 2
+    return camera_above(middle + (place - middle) / EDGE, _longest_way_rad(place) + np.pi / 2, aspect)
+
+
+def _story_places(replay: Replay, experiment: Experiment, stories: Mapping[int, tuple[float, float]]) -> Float:
+    """(3, K) places of shown objects during their stories: of the first one, and of others near enough to it."""
+    place = np.empty((3, 0))
+    for k, (first_s, last_s) in stories.items():
+        time_s = np.arange(first_s, last_s + SMOOTH_S / 4, SMOOTH_S / 4)
+        own = interpolate_places(replay.scene, replay.truth, experiment, np.full(len(time_s), k), time_s)[:3]
+        both = np.concatenate([place, own[:, ~np.isnan(own[0])]], axis=1)
+        if both.size and (not place.size or np.ptp(both[:2], axis=1).max() <= NEARBY_M):
+            place = both
+    return place
 
 
 @dataclass(frozen=True)

@@ -211,13 +211,22 @@ TYPES = {
 """The files of the web viewer, with their media types."""
 POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; "
-    "connect-src 'self'; img-src 'self' data: blob:; worker-src 'self' blob:"
+    "connect-src 'self'; img-src 'self' data: blob:; worker-src 'self' blob:; frame-ancestors 'none'"
 )
-"""Content-Security-Policy: the page loads from this server only."""
+"""Content-Security-Policy: the page loads from this server only, and is in no other page."""
 _ELSEWHERE = re.compile(rb'<link\s[^>]*href="https?://[^>]*>')
-# A script that opens the recordings from the page's own address, and moves each to its instant once it is loaded.
+# A script that opens the recordings from the page's own address, and moves each to its instant once it is loaded. What
+# shows until then is ours, but for words of the viewer on why it does not load.
 _OPEN = """<script>
-const recordings = %s, requests = %s;
+const recordings = %s, requests = %s, tries = %d;
+const cover = document.createElement("div");
+cover.id = "cover";
+cover.setAttribute("role", "status");
+cover.style.cssText = "position: fixed; inset: 0; z-index: 9; display: grid; place-content: center; " +
+  "background: #0d1011; color: #e8e8e8; font: 16px system-ui, sans-serif; white-space: pre-line; text-align: center";
+document.documentElement.append(cover);
+const say = (words) => (cover.textContent = `copem-replay view\\n${words}`);
+say("loading the viewer …");
 const page = new URLSearchParams(location.search);
 if (!page.has("url")) {
   for (const name of recordings) page.append("url", new URL(name, location.origin).href);
@@ -242,9 +251,15 @@ function loading(state) {
 }
 addEventListener("load", async () => {
   const wait = () => new Promise((done) => setTimeout(done, 200));
-  while (!window._handle || loading(window._handle.viewer_state())) await wait();
+  for (let left = tries; !window._handle || loading(window._handle.viewer_state()); left--) {
+    const told = document.getElementById("center_text"), percent = document.getElementById("status");
+    const names = recordings.map(decodeURIComponent).join(", ");
+    say(window._handle ? `loading ${names} …` : `loading the viewer … ${percent?.textContent || ""}`);
+    if (left < 0 || (told.classList.contains("visible") && !percent)) cover.remove();
+    await wait();
+  }
   for (const request of requests) {
-    for (let left = %d; left > 0; left--) {
+    for (let left = tries; left > 0; left--) {
       try {
         await window._handle.viewer_control(new Uint8Array(request));
         break;
@@ -253,6 +268,11 @@ addEventListener("load", async () => {
       }
     }
   }
+  for (let left = tries, size = 0, before = -1; left > 0 && size !== before; left--) {
+    await wait();
+    [before, size] = [size, window._handle.viewer_state().length];
+  }
+  cover.remove();
   document.documentElement.dataset.opened = "";
 });
 </script>"""
@@ -410,6 +430,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(size))
-        self.send_header("Content-Security-Policy", POLICY)
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
+
+    def end_headers(self) -> None:
+        """End the headers of any answer, also of errors."""
+        self.send_header("Content-Security-Policy", POLICY)
+        self.send_header("X-Content-Type-Options", "nosniff")
+        super().end_headers()

@@ -49,8 +49,11 @@ def test_the_page_opens_at_the_instant_of_the_recording_and_asks_nobody_else(tmp
         browser = webdriver.Chrome(options=options, service=Service(driver))
         try:
             browser.get(f"{server.url}?renderer=webgl")
+            shown = browser.execute_script("return document.elementFromPoint(400, 300).innerText")
+            assert shown.startswith("copem-replay view\nloading"), "not what the viewer shows while it loads"
             opened = "return document.documentElement.dataset.opened !== undefined"
             WebDriverWait(browser, 240).until(lambda _: browser.execute_script(opened))
+            assert browser.execute_script("return document.elementFromPoint(400, 300).tagName") == "CANVAS"
             state = bytes(browser.execute_script("return [...window._handle.viewer_state()]"))
             log = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
         finally:

@@ -259,7 +259,8 @@ def test_the_nearest_false_entries_are_named_by_their_places(tmp_path: Path) -> 
     assert far["Points3D:labels"] == ["false ↓ 70 m"], "the other one is farther away than pictures are wide"
 
 
-def test_without_an_ego_the_whole_site_is_in_view(tmp_path: Path) -> None:
+def test_without_an_ego_the_story_and_units_around_are_in_view_and_without_one_the_whole_site(tmp_path: Path) -> None:
+    """The car's first second, 14 m long, and the pole 22 m from its end; the other car is 400 m away."""
     scene = recording(
         [Thing("7", "car", driving(40, 0, -10, 10)), Thing("8", "car", driving(-300, -200, 50, 40))],
         until_s=8.0, ego=None,
@@ -269,12 +270,15 @@ def test_without_an_ego_the_whole_site_is_in_view(tmp_path: Path) -> None:
         units={"pole": pole}, configurations={"pole": {"units": ["pole"]}}, measure={"distance_to": "pole"}
     )
     replay = prepare_log(scene, given)
-    eye = written(tmp_path / "x.rrd", replay, given, {0: (0.0, 1.0)})
-    [still] = origins(tmp_path / "x.rrd", eye)
-    every = np.concatenate([corners(replay, row) for row in range(len(replay.truth.frame_ix))])
-    seen = picture(eye, still, np.concatenate([every, [[20, -10, 0]]]))
-    assert np.abs(seen).max() <= 1.02
-    assert np.ptp(seen[:, 0]) > 1.8, "as large as it can be"
+    rows_of = replay.truth.row_object_ix == replay.scene.object_number["7"]
+    story = rows_of & (replay.truth.row_captured_s <= 1.0)
+    for stories, kept, wide in (({replay.scene.object_number["7"]: (0.0, 1.0)}, story, 1.3), ({}, rows_of | True, 1.5)):
+        eye = written(tmp_path / f"{wide}.rrd", replay, given, stories)
+        [still] = origins(tmp_path / f"{wide}.rrd", eye)
+        every = np.concatenate([corners(replay, row) for row in np.flatnonzero(kept)])
+        seen = picture(eye, still, np.concatenate([every, [[20, -10, 0]]]))
+        assert np.abs(seen).max() <= 1.02
+        assert np.ptp(seen, axis=0).max() > wide, "as large as it can be, but for words at the edge"
     assert select_perceiving(given, ["pole"]) == ["pole"]
 
 

@@ -642,7 +642,7 @@ def test_at_most_thirty_seven_bytes_a_box_and_a_layout(tmp_path: Path) -> None:
         int(fused_tracks.fused.valid.sum()) for fused_tracks in made.run_tracks.values()
     )
     assert boxes > 70_000
-    layout = 600_000  # whatever the number of boxes
+    layout = 650_000  # whatever the number of boxes
     assert made.path.stat().st_size <= 37 * boxes + layout
 
 

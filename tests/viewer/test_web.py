@@ -150,7 +150,9 @@ class TestServer:
         assert b'"a%20b.rrd"' in page
         assert headers["Content-Type"] == "text/html; charset=utf-8"
         assert headers["Content-Security-Policy"] == POLICY
+        assert "frame-ancestors 'none'" in POLICY
         assert got(f"{server.url}re_viewer_bg.wasm")[1]["Content-Type"] == "application/wasm"
+        assert headers["X-Content-Type-Options"] == "nosniff"
         assert got(f"{server.url}a%20b.rrd")[0] == b"\x00recording" * 100_000
 
     @pytest.mark.parametrize("name", ["secret", "../secret", "%2e%2e/secret", "gone.rrd", "re_viewer_bg"])
@@ -158,6 +160,7 @@ class TestServer:
         with pytest.raises(urllib.error.HTTPError) as refused:
             got(server.url + name)
         assert refused.value.code == 404
+        assert refused.value.headers["X-Content-Type-Options"] == "nosniff"
         refused.value.close()
 
     @pytest.mark.parametrize("name", ["", "a%20b.rrd", "re_viewer.js"])
