@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 from copem_replay.cli import main as cli
+from copem_replay.core.colours import configuration_colours
 from copem_replay.experiment.schema import Experiment
 from copem_replay.viewer.side_by_side import ComparedExperiment, join_experiments
 from copem_replay.viewer.sink import ELAPSED
@@ -66,6 +67,12 @@ def test_two_folders_beside_each_other(call: Compare, tmp_path: Path) -> None:
     entities = {chunk.entity_path for chunk in _all(path)}
     assert {"/world/a:PEM/boxes", "/world/a:GT/boxes", "/world/b:PEM/boxes"} <= {p.replace("\\", "") for p in entities}
     assert not any("b:PEM/difference" in entity.replace("\\", "") for entity in entities), "it is what they differ from"
+
+    # The first folder's configurations have the colours of its own files, whatever is compared.
+    colour = {name: at(path, rf"/world/{name}/boxes", 2.0)["Boxes3D:colors"][0] >> 8 for name in (r"a\:PEM", r"a\:GT")}
+    of_a = configuration_colours(["GT", "PEM"], ["GT"]).values()
+    assert list(colour.values())[::-1] == [red << 16 | green << 8 | blue for red, green, blue in of_a]
+    assert at(path, r"/world/b\:PEM/boxes", 2.0)["Boxes3D:colors"][0] >> 8 not in colour.values()
 
     # Until 1.4 s only b holds the car, above whose true place that stands; from 1.5 s on both do.
     lost = rows(path, r"/world/a\:PEM/difference/lost")
