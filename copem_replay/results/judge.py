@@ -180,14 +180,8 @@ def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
     """How many logs, objects, passes or runs would decide: `about 57 objects like these would decide, 13 now`."""
     over, number = found.over or "logs", found.clusters or 0
     known = Known(over, number, found.units)
-    needed = count_deciding(
-        criterion.metric,
-        found.figure,
-        criterion.bound,
-        known,
-        criterion.confidence,
-        paired=criterion.against is not None,
-    )
+    paired = criterion.against is not None
+    needed = count_deciding(criterion.metric, found.figure, criterion.bound, known, criterion.confidence, paired=paired)
     if needed is None and abs((found.figure.value or 0.0) - criterion.bound) <= _AT_BOUND:
         return f"no number of {over} decides: it is at the bound ({number} now)"
     if needed is None:

@@ -119,18 +119,12 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         has_digest = recording.sha256 is not None or recording.stamps is not None
         if has_digest and stamps != recording.stamps and sha256_of(here) != recording.sha256:
             raise RecordingError("it is no longer what was replayed", path=first_recording(recording.place))
+        truth = draw_truth(run.replayed, table) if show is None or show.truth else None
+        truths = {name for name, of in run.every.items() if of.units == TRUTH}
         notes = write_mcap(
-            path,
-            here,
-            run.replayed.replay.scene,
-            run.replayed.run_tracks,
-            table,
-            run.manifest,
-            find_family(recording),
-            recording.window,
-            draw_truth(run.replayed, table) if show is None or show.truth else None,
-            colours=configuration_colours(run.every, {name for name, of in run.every.items() if of.units == TRUTH}),
-        )
+            path, here, run.replayed.replay.scene, run.replayed.run_tracks, table, run.manifest,
+            find_family(recording), recording.window, truth, configuration_colours(run.every, truths),
+        )  # fmt: skip
         check_files_unchanged(stamps)
     return notes
 
@@ -291,28 +285,15 @@ def _find_recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _logs_table(folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
     """The rows of `logs.csv`: the replayed logs and the skipped recordings."""
-    rows = [
-        {
-            "log": log.name,
-            "path": escape_name(
-                " + ".join(recording_name(replayed, folder) for replayed in list_recordings(log.recording.place))
-            ),
-            "sha256": log.digests["sha256"],
-            "episodes": facts.episodes,
-            "rows": study.counts[log.name],
-            "state": "done",
-        }
-        for log, facts in zip(study.logs, study.facts, strict=True)
-    ]
-    rows += [
-        {
-            "log": None,
-            "path": escape_name(recording_name(path, folder)),
-            "state": "skipped",
-            "reason": escape_name(why),
-        }
-        for path, why in skipped
-    ]
+    rows: list[dict[str, Any]] = []
+    for log, facts in zip(study.logs, study.facts, strict=True):
+        path = " + ".join(recording_name(replayed, folder) for replayed in list_recordings(log.recording.place))
+        counts = {"episodes": facts.episodes, "rows": study.counts[log.name]}
+        done = {"log": log.name, "path": escape_name(path), "sha256": log.digests["sha256"], "state": "done"}
+        rows.append(done | counts)
+    for place, why in skipped:
+        left_out = {"path": escape_name(recording_name(place, folder)), "reason": escape_name(why)}
+        rows.append({"log": None, "state": "skipped"} | left_out)
     return TABLES["logs.csv"].frame(rows)
 
 
@@ -320,14 +301,8 @@ def _read_table(study: StudyTables) -> pd.DataFrame:
     """The rows of `read.csv`: what was left out or mended of each log, what changes figures first."""
     none: dict[str, object] = {"number": 0, "what": "nothing was left out or mended", "changes": False}
     rows = [
-        {
-            "log": log.name,
-            "topic": log.recording.topic,
-            "frames": log.frames,
-            "entries": log.object_states,
-            **found,
-            "changes": "yes" if found["changes"] else "no",
-        }
+        {"log": log.name, "topic": log.recording.topic, "frames": log.frames, "entries": log.object_states, **found}
+        | {"changes": "yes" if found["changes"] else "no"}
         for log in study.logs
         for found in sorted(list_read(log.recording) or [none], key=lambda one: not one["changes"])
     ]
