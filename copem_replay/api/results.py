@@ -47,10 +47,11 @@ def compare(
 ) -> Comparison:
     """Compare configurations with a baseline, paired by log, object and run, within or across results folders.
 
-    `configurations`: only these; None: all. `baseline`: None: the one named `ideal`, else the ideal fusion of the same
-    inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which times
-    to detection are compared once more; None: those of the baseline. `by`: entries by which rows are grouped, each
-    group compared for itself, in `groups` of the result: `["class", "log*class"]`. Its `table` has a row per log,
+    `configurations`: only these; None: all. `baseline`: None: of several folders each configuration is held against
+    itself in the first one, `cr.compare([old, new])`; of one it is the one named `ideal`, else the ideal fusion of the
+    same inputs, else the first that is not the truth. `false_positives_per_min`: false positives per minute at which
+    times to detection are compared once more; None: those of the baseline. `by`: entries by which rows are grouped,
+    each group compared for itself, in `groups` of the result: `["class", "log*class"]`. Its `table` has a row per log,
     configuration and metric: `difference` with the limits `low` and `high` of its 95 % interval. `decide`: the one
     metric that was named to decide, of which alone there are stars; None: all, held together. `matters`: by metric the
     least difference that matters, by which each is better, worse, alike or open.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,9 +26,14 @@ from copem_replay.cli.terminal import (
 )
 from copem_replay.core.errors import InputError
 
+if TYPE_CHECKING:
+    from copem_replay.results.compare import Comparison
+
 
 def compare(
-    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="Results folders, one or several.")],
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER", help="Results folder; or the older one, then newer ones.")
+    ],
     configurations: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Only these, and the baseline [all].")
     ] = None,
@@ -60,12 +66,14 @@ def compare(
     ] = None,
     fail_on: Annotated[
         list[str] | None,
-        typer.Option(metavar="'METRIC > N'", help="Exit with 1 if the first folder is shown to be worse by so much."),
+        typer.Option(metavar="'METRIC > N'", help="Exit with 1 if the newer folder is shown to be worse by so much."),
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON: the answer, notes and every row.")] = False,
 ) -> int:
-    """Compare configurations with a baseline, with intervals.
+    """Compare configurations with a baseline, or results with older ones.
 
-    They are paired by log, object and run, within a results folder or across several.
+    They are paired by log, object and run. OLD NEW: each configuration of the newer results folder minus itself in the
+    older one, and in one line whether it is better or worse.
     """
     from copem_replay.api.results import compare as compare_results
     from copem_replay.results.compare import check_out, comparison_text, write_comparison
@@ -73,12 +81,13 @@ def compare(
     from copem_replay.results.decision import decide_compared
     from copem_replay.results.read import open_results
     from copem_replay.results.screen import choose_notes, format_comparison
+    from copem_replay.results.versions import tell_change
 
     if out is not None:
         check_out(out)
     _check_rrd_options(rrd, run, log)
     names = split_names(configurations)
-    conditions = _check_fail_on(fail_on, folders, names, baseline)
+    _check_fail_on(fail_on, folders, names, baseline)
     comparison = compare_results(
         folders,
         configurations=names,
@@ -93,16 +102,26 @@ def compare(
     if rrd is not None:
         from copem_replay.viewer.side_by_side import write_side_by_side
 
-        notes += write_side_by_side(rrd, folders, configurations=names, baseline=baseline, log=log, run=run)
-    print_notes(notes)
-    alone = open_results(folders[0]) if len(folders) == 1 else None
-    decision = decide_compared(comparison) if alone is None else decide_on(alone, comparison)
-    if whole:
-        print_table(comparison_text(comparison, width_of(sys.stdout)), decision.best)
+        drawn = names if names or not comparison.newer else [*comparison.changed.configurations] or None
+        notes += write_side_by_side(rrd, folders, configurations=drawn, baseline=baseline, log=log, run=run)
+    print_notes(() if as_json else notes)
+    if comparison.newer:
+        head, told, marked = tell_change(comparison)
+        answer: tuple[str, ...] = (told,)
     else:
-        print_rows(*format_comparison(comparison, decision.best))
-        print_line("every figure: --explain")
-    if by is not None and len(folders) == 1:
+        alone = open_results(folders[0]) if len(folders) == 1 else None
+        decision = decide_compared(comparison) if alone is None else decide_on(alone, comparison)
+        head, answer, marked = "", decision.sentences, decision.best
+    if as_json:
+        print(_format_json(comparison, " ".join(answer)))
+    else:
+        print_rows([head] if head else [])
+        if whole:
+            print_table(comparison_text(comparison, width_of(sys.stdout)), marked)
+        else:
+            print_rows(*format_comparison(comparison, marked))
+            print_rows([] if comparison.newer else ["every figure: --explain"])
+    if by is not None and len(folders) == 1 and not as_json:
         from copem_replay.results.slices import groups_text, summarise_slices
 
         table = summarise_slices(open_results(folders[0]), split_entries(by))
@@ -111,10 +130,23 @@ def compare(
         print(f"\n{groups_text(table[table['configuration'].isin(shown)], width_of(sys.stdout))}")
     if out is not None:
         write_comparison(comparison, out, folders)
-    _print_written(out, rrd)
-    code = _judge_differences(conditions, folders)
-    print_answer(decision.sentences)
+    if not as_json:
+        _print_written(out, rrd)
+    if comparison.newer:  # what both have
+        names = [name for name in comparison.configurations if name not in comparison.truths]
+    code = _judge_differences(_check_fail_on(fail_on, folders, names, baseline), folders, quiet=as_json)
+    if not as_json:
+        print_answer(answer)
     return code
+
+
+def _format_json(comparison: Comparison, answer: str) -> str:
+    """A comparison as JSON: the answer, what it is against, notes, and the rows of `--out x.csv`, null where empty."""
+    tables = [comparison.table, *([] if comparison.groups is None else [comparison.groups])]
+    rows = [row for table in tables for row in json.loads(table.to_json(orient="records", double_precision=15))]
+    said = {"answer": answer, "baseline": comparison.baseline, "newer": comparison.newer}
+    said |= {"unchanged": comparison.unchanged, "notes": comparison.notes, "rows": rows}
+    return json.dumps(said, ensure_ascii=False, indent=1)
 
 
 def _parse_matters(text: str) -> tuple[str, float]:
@@ -128,29 +160,30 @@ def _parse_matters(text: str) -> tuple[str, float]:
 def _check_fail_on(
     conditions: list[str] | None, folders: list[Path], names: list[str] | None, baseline: str | None
 ) -> dict[str, dict[str, Any]]:
-    """Criteria of the conditions of `--fail-on`: differences to the second folder, or to the baseline."""
+    """Criteria of the conditions of `--fail-on`: differences to the first of two folders, or to the baseline."""
     if not conditions:
         return {}
     from copem_replay.experiment.criteria import BEFORE, parse_fail_on
 
     if len(folders) != 2 and baseline is None:
-        raise InputError(f"--fail-on: expected two folders, NEW OLD, or --baseline NAME, found {len(folders)}")
+        raise InputError(f"--fail-on: expected two folders, OLD NEW, or --baseline NAME, found {len(folders)}")
     against = BEFORE if len(folders) == 2 and baseline is None else str(baseline)
     return parse_fail_on(conditions, against, names)
 
 
-def _judge_differences(criteria: dict[str, dict[str, Any]], folders: list[Path]) -> int:
+def _judge_differences(criteria: dict[str, dict[str, Any]], folders: list[Path], *, quiet: bool) -> int:
     if not criteria:
         return 0
     from copem_replay.api.results import judge
     from copem_replay.results.judge import find_population
     from copem_replay.results.read import open_results
 
-    population = find_population(open_results(folders[0], "tally.parquet"))
+    population = find_population(open_results(folders[-1], "tally.parquet"))
     criteria = {name: criterion | {"population": population} for name, criterion in criteria.items()}
-    verdicts = judge(folders[0], criteria, before=folders[1] if len(folders) > 1 else None)
-    print_line("")
-    print_verdicts(verdicts)
+    verdicts = judge(folders[-1], criteria, before=folders[0] if len(folders) > 1 else None)
+    if not quiet:
+        print_line("")
+        print_verdicts(verdicts)
     return 0 if verdicts.passes else 1
 
 

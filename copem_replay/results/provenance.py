@@ -50,13 +50,13 @@ _WAYS_OUT = "put the log back (a link to it does), or run the experiment again"
 class RecordedLog:
     """A recording that was replayed: its name in the tables, the topic of its truth, the SHA-256 of its content.
 
-    `truth`: the SHA-256 of its truth, None in results of older versions. `tags`: by name.
+    `truth`: the SHA-256 of its truth. `tags`: by name.
     """
 
     name: str
     topic: str | None
     sha256: str
-    truth: str | None = None
+    truth: str
     tags: Mapping[str, str] = field(default_factory=dict)
 
     def check_same(self, digest: str, path: File) -> None:
@@ -117,7 +117,7 @@ def parse_provenance(data: Any, place: Path) -> Provenance:
     if (found := dict(data).get("format", 1)) != FORMAT:
         raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
     logs = tuple(
-        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), log.get("truth"), _parse_tags(log))
+        RecordedLog(str(log["log"]), log.get("topic"), str(log["sha256"]), str(log["truth"]), _parse_tags(log))
         for log in data["logs"]
     )
     notes = [*data.get("notes", []), *(log[name] for log in data.get("logs_skipped", []) for name in _SKIPPED)]

@@ -21,7 +21,7 @@ from copem_replay.metrics.onset import has_frame_after
 from copem_replay.metrics.summary import describe_no_needless
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.limits import STAR
-from copem_replay.results.compare.tables import NOTHING
+from copem_replay.results.compare.tables import NOTHING, explain_no_interval
 from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE, tell_seconds
 
 if TYPE_CHECKING:
@@ -107,10 +107,10 @@ def _format_cell(row: Any, column: _Column) -> str:
     return column.never if value is None or pd.isna(value) else column.format(float(value))
 
 
-def _join_names(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str], room: int = _NAMES) -> str:
     """`gnn, union`; `gnn and 3 more` where they do not fit."""
     whole = ", ".join(names)
-    return whole if len(whole) <= _NAMES or len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+    return whole if len(whole) <= room or len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _format_table(columns: Sequence[_Column], rows: Sequence[tuple[str, ...]]) -> list[str]:
@@ -174,7 +174,7 @@ def _describe_left_out(results: Results) -> str:
 # The screen of a comparison.
 
 _WIDE = 80
-_COMPARED = {
+SHOWN = {
     "ttd_rmst_s": "known", SHARE: "brakes for nothing", "pass_share": "brakes in time",
     "position_rmse_held_m": "position error, m", "false_positives_per_min": "false per minute",
 }  # fmt: skip
@@ -184,7 +184,7 @@ _COMPARED = {
 def choose_notes(notes: Sequence[str]) -> list[str]:
     """Notes without those that are about other figures than those of the screen."""
     named = [{*re.findall(r"\w+", note)} & {*COMPARED} for note in notes]
-    return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*_COMPARED}]
+    return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*SHOWN}]
 
 
 def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -192,28 +192,33 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
     overall = comparison.overall
     rows = {(row.configuration, row.metric): row for row in overall.itertuples(index=False)}
     least = {SHARE: MATTERS_SHARE}
-    names = [name for name in comparison.configurations if name not in comparison.truths] or comparison.configurations
+    same = [name for name in comparison.unchanged if name not in comparison.truths]
+    folded = [f"{_join_names(same, _WIDE)}: unchanged"] if same else []
+    told = comparison.changed.configurations
+    if not (names := [name for name in told if name not in comparison.truths] or told):
+        return folded, []
     overall = overall[overall["configuration"].isin(names)]
     cells = {
-        metric: [_tell_difference(metric, rows.get((name, metric))) for name in names]
-        for metric in _COMPARED
+        metric: [tell_difference(metric, rows.get((name, metric)), alike=bool(comparison.newer)) for name in names]
+        for metric in SHOWN
         if overall.loc[overall["metric"] == metric, "difference"].abs().gt(least.get(metric, NOTHING)).any()
     }
     packed = _pack_columns(names, cells)
     tables = [_tabulate_differences(names, {metric: cells[metric] for metric in of}, best) for of in packed]
     shown = tables[: max(1, _MOST_ROWS // len(tables[0][0]))] if tables else []
     lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
+    lines += folded
     starred = any(f" {STAR}" in line for line in lines)
-    told = [metric for metric in _COMPARED if metric in cells and metric != SHARE]  # which is of drives
-    return [*_describe_pairs(comparison, told or ["ttd_rmst_s"], starred), *lines], [
+    limited = [metric for metric in SHOWN if metric in cells and metric != SHARE]  # which is of drives
+    return [*_describe_pairs(comparison, limited or ["ttd_rmst_s"], starred), *lines], [
         line for _, marked in shown for line in marked
     ]
 
 
 def _pack_columns(names: Sequence[str], cells: Mapping[str, Sequence[str]]) -> list[list[str]]:
     """Metrics that stand side by side, in as many tables as it takes."""
-    widths = {metric: 2 + max(map(len, [_COMPARED[metric], *of_metric])) for metric, of_metric in cells.items()}
-    room, packed = _WIDE - min(_NAMES, max(map(len, names))), list[list[str]]()
+    widths = {metric: 2 + max(map(len, [SHOWN[metric], *of_metric])) for metric, of_metric in cells.items()}
+    room, packed = _WIDE - min(_NAMES, len(", ".join(names))), list[list[str]]()
     for metric in cells:
         fits = [of for of in packed if sum(widths[other] for other in [*of, metric]) <= room]
         if not fits:
@@ -231,7 +236,7 @@ def _tabulate_differences(
     for k, name in enumerate(names):
         grouped.setdefault(tuple(of_metric[k] for of_metric in cells.values()), []).append(name)
     shown = list(grouped)[:_MOST_ROWS]
-    table = [("", *(_COMPARED[metric] for metric in cells)), *((_join_names(grouped[of]), *of) for of in shown)]
+    table = [("", *(SHOWN[metric] for metric in cells)), *((_join_names(grouped[of]), *of) for of in shown)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in table]
     marked = [line for line, of in zip(lines[1:], shown, strict=True) if {*grouped[of]} & {*best}]
@@ -246,10 +251,12 @@ def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: boo
         for kind, of in limited[limited["metric"] == metric].groupby("interval_over"):
             counts = of["clusters"].astype(int)
             over.setdefault(describe_clusters(str(kind), counts.max(), counts.min()), []).append(
-                _COMPARED[metric].partition(", ")[0]
+                SHOWN[metric].partition(", ")[0]
             )
     why = "" if comparison.baseline_why is None else f" ({comparison.baseline_why})"
-    yield f"against {comparison.baseline}{why}; --baseline names another"
+    against = f"against {comparison.baseline}{why}; --baseline names another"
+    itself = f"each minus itself in {comparison.baseline}; --explain: every figure; --baseline: all against one"
+    yield itself if comparison.newer else against
     for k, (words, headers) in enumerate(over.items()):
         of_what = f" of {' and '.join(headers)}" if len(over) > 1 else ""
         yield f"[95 %]{of_what}: over {words if k == 0 else words.partition(': ')[0]}"
@@ -257,8 +264,10 @@ def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: boo
         yield f"{STAR}: the interval excludes 0, all differences together held at 95 %"
 
 
-def _tell_difference(metric: str, row: Any) -> str:
-    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; of other metrics with a sign."""
+def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
+    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; of other metrics with a sign. `alike`: also
+    why there is no interval.
+    """
     if row is None or pd.isna(row.difference):
         return "–"
     size, limits = float(row.difference), (row.low, row.high)
@@ -274,5 +283,5 @@ def _tell_difference(metric: str, row: Any) -> str:
             if abs(size) < NOTHING
             else f"{'+' if size > 0 else ''}{format_limit(size)}" + (" points" if "share" in metric else "")
         )
-    marks = [STAR] if row.star == STAR else []
+    marks = [STAR] if row.star == STAR else [f"({why})" for why in explain_no_interval(row) if alike and told != "±0"]
     return " ".join([told, *([format_limits(*limits)] if known and told != "±0" else []), *marks])

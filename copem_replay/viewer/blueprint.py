@@ -86,7 +86,7 @@ class RecordingContent:
     above: Camera
     named: Sequence[str]
     lists: Mapping[str, Sequence[UnitLists]]
-    baseline: str | None = None
+    baselines: tuple[str, ...] = ()
     too_short: Sequence[str] = ()
     opens_s: float | None = None
     counted: pd.DataFrame | None = None
@@ -204,15 +204,16 @@ def choose_overview(content: RecordingContent) -> list[str]:
     """The configurations of the overview: all with units, of more than four the baseline and those that differ most.
 
     The baseline is the first one with units, unless configurations are compared with another. The rest is spread evenly
-    from the one that knows the shown objects first to the one that knows them last.
+    from the one that knows the shown objects first to the one that knows them last. Of several baselines the first
+    stand beside what is held against them.
     """
     perceiving = select_perceiving(content.experiment, content.configurations)
-    if len(perceiving) <= OVERVIEW:
-        return perceiving
+    if len(perceiving) <= OVERVIEW or len(content.baselines) > 1:
+        return perceiving[:OVERVIEW]
     rows = content.table[content.table["object_id"].isin([content.replay.scene.object_ids[k] for k in content.objects])]
     after_s = rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"])
     mean_s = after_s.groupby(rows["configuration"]).mean()
-    baseline = content.baseline if content.baseline in perceiving else perceiving[0]
+    baseline = next((name for name in content.baselines if name in perceiving), perceiving[0])
     ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
     places = OVERVIEW - 1
     chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {baseline}
@@ -313,8 +314,9 @@ def errors_page(content: RecordingContent) -> rrb.Container:
     plots = []
     for k in content.objects:
         kinds = {"position_error": f"{content.id_of(k)}: position error, m"}
-        if content.baseline is not None:
-            kinds = {"error_difference": f"{content.id_of(k)}: more error than {content.baseline}, m"} | kinds
+        if content.baselines:
+            less = content.baselines[0] if len(content.baselines) == 1 else "before"
+            kinds = {"error_difference": f"{content.id_of(k)}: more error than {less}, m"} | kinds
         views = [
             _curves_view(make_entity_path("plots", kind, names[k]), title, content.axis(k))
             for kind, title in kinds.items()
@@ -512,7 +514,7 @@ def digest_layout(content: RecordingContent) -> str:
         [content.axes_s[k] for k in content.objects],
         list(content.named),
         *content.selected_ns,
-        content.baseline,
+        content.baselines or None,
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
         *(["map"] if content.with_map else []),

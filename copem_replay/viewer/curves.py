@@ -303,13 +303,12 @@ _ABOVE_M, _LOST_POINTS, _GAINED_POINTS = 3.5, 6.0, 3.0
 
 def write_differences(
     out: RecordingSink, replay: Replay, experiment: Experiment, run_tracks: Mapping[str, FusedTracks],
-    table: pd.DataFrame, baseline: str, shown: Sequence[int], colours: Mapping[str, Rgb],
+    table: pd.DataFrame, baselines: Mapping[str, str], shown: Sequence[int], colours: Mapping[str, Rgb],
 ) -> None:  # fmt: skip
-    """Write the differences of every other configuration to the baseline."""
-    second = run_tracks[baseline].fused
-    for name in run_tracks:
-        if name != baseline:
-            first = run_tracks[name].fused
+    """Write the differences of every configuration to its baseline."""
+    for name, baseline in baselines.items():
+        if name in run_tracks:
+            first, second = run_tracks[name].fused, run_tracks[baseline].fused
             _write_knowledge_points(out, replay, experiment, name, first, baseline, second)
             _write_error_differences(out, replay, experiment, name, first, second, shown, colours[name])
             own, baseline_rows = (table[table["configuration"] == configuration] for configuration in (name, baseline))

@@ -9,6 +9,7 @@ from functools import cached_property
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -90,8 +91,9 @@ def write_rrd(
     run: int,
     *,
     run_is: str = "",
-    baseline: str | None = None,
+    baselines: Mapping[str, str] = MappingProxyType({}),
     of_one: bool = True,
+    colours: Mapping[str, Rgb] | None = None,
     needless: pd.DataFrame | None = None,
     false_tracks: pd.DataFrame | None = None,
     viewer: str | None = None,
@@ -104,17 +106,18 @@ def write_rrd(
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
-    logs and runs. `run_is`: why this run is shown, part of the recording's name. `baseline`: the configuration to which
-    differences are marked. `of_one`: all configurations are of one experiment, so that nothing but their keys differs.
-    `needless`, `false_tracks`: rows of these tables of this log and run; None: not asked for.
+    logs and runs. `run_is`: why this run is shown, part of the recording's name. `baselines`: what configurations are
+    held against, so that differences are marked. `colours`: by configuration; None: as in all files of the experiment.
+    `of_one`: all configurations are of one experiment, so that nothing but their keys differs. `needless`,
+    `false_tracks`: rows of these tables of this log and run; None: not asked for.
     """
     counted, table = select_counted(table, experiment.measure.began), first_episodes(table)
     later_chunks = iter(run_tracks)
     first = next(later_chunks)
     truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
-    beside = [name for name in first if name not in truths] if baseline is None else []
-    parts = split_into_files(beside or list(first), baseline)
+    beside = [name for name in first if name not in truths] if not baselines else []
+    parts = split_into_files(beside or list(first), baselines)
     shown = choose_shown_objects(replay.scene, replay.truth, experiment, table)
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
@@ -122,20 +125,20 @@ def write_rrd(
         files = []
         for part in parts:
             content = replace(
-                _build_content(replay, experiment, table, part.configurations, shown, first, baseline),
+                _build_content(replay, experiment, table, part.configurations, shown, first, baselines),
                 of_one=of_one, counted=counted, false_tracks=false_tracks,
             )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            colours = configuration_colours(experiment.configurations, truths)
-            files.append(_RecordingFile(out, content, {name: colours[name] for name in part.configurations}))
+            by_name = colours or configuration_colours(experiment.configurations, truths)
+            files.append(_RecordingFile(out, content, {name: by_name[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
-        if baseline is not None:  # of all objects at once: such a log is not long
+        if baselines:  # of all objects at once: such a log is not long
             for file in files:
                 compared = {name: first[name] for name in file.colours}
-                write_differences(file.out, replay, experiment, compared, table, baseline, objects, file.colours)
+                write_differences(file.out, replay, experiment, compared, table, baselines, objects, file.colours)
         chunks = chain(iter([first]), later_chunks)
         for file in files:
             _write_brakes_and_false_tracks(file, replay, needless, false_tracks)
@@ -180,7 +183,7 @@ class _RecordingFile:
 
 def _build_content(
     replay: Replay, experiment: Experiment, table: pd.DataFrame, configurations: Sequence[str], shown: ShownObjects,
-    first: Mapping[str, FusedTracks], baseline: str | None,
+    first: Mapping[str, FusedTracks], baselines: Mapping[str, str],
 ) -> RecordingContent:  # fmt: skip
     """What a file with these configurations shows. `first`: fused tracks of the first time chunk, with all lists."""
     by_name, scene, objects = experiment.configurations, replay.scene, shown.object_ix
@@ -200,7 +203,7 @@ def _build_content(
     compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
         replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units),
-        lists, baseline, shown.too_short, find_opening_s(experiment, compared),
+        lists, tuple(dict.fromkeys(baselines.values())), shown.too_short, find_opening_s(experiment, compared),
     )  # fmt: skip
 
 

@@ -3,6 +3,8 @@
 A results folder holds no lists, but experiment, logs and seed, which determine them. So the run is computed again and
 checked against the table of its folder. The experiments of the folders are joined into one; nothing is drawn with it,
 since random keys hold names of units, and different units of one name get other names in it.
+
+Configurations are held against one of them, or each against itself in an older folder, where it is paler.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from copem_replay.communication.link import LinkModel
+from copem_replay.core.colours import REST, Rgb, configuration_colours
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.files import remove_leftovers
 from copem_replay.experiment.drive import resolve_for_log
@@ -28,8 +31,9 @@ from copem_replay.results.compare.compare import read_folders
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
     check_comparable,
-    choose_configurations,
     label_configurations,
+    name_folders,
+    pair_configurations,
 )
 from copem_replay.results.folder import add_to_made_list
 from copem_replay.results.outputs import check_output
@@ -134,7 +138,7 @@ def write_side_by_side(
 ) -> list[str]:
     """Write one run (None: the one shown in the baseline's folder) as a recording with marked differences.
 
-    Configurations and baseline as in `compare`. Returns notes. Raises InputError; RecordingError if a log is not the
+    Configurations and baselines as in `compare`. Returns notes. Raises InputError; RecordingError if a log is not the
     one that was replayed; OutputError.
     """
     from copem_replay.viewer import write_rrd
@@ -142,11 +146,13 @@ def write_side_by_side(
     check_side_by_side(path)
     all_results = read_folders(folders)
     check_comparable(all_results)
-    chosen = choose_configurations(label_configurations(all_results), configurations, baseline)
+    pairs = pair_configurations(all_results, configurations, baseline)
     if configurations is None:  # the truth is in every view: beside others it is left out
-        beside = [choice for choice in chosen[1:] if not choice.results.facts[choice.configuration].truth]
-        chosen = (chosen[0], *(beside or chosen[1:]))
+        pairs = {one: other for one, other in pairs.items() if not one.facts.truth} or pairs
+    chosen = list(dict.fromkeys(choice for pair in pairs.items() for choice in reversed(pair)))  # baselines first
     labels = [choice.label for choice in chosen]
+    baselines = {one.label: other.label for one, other in pairs.items()}
+    versions = baseline is None and len(all_results) == 2
     _check_one_recording(list(dict.fromkeys(choice.results for choice in chosen)))
     used = [check_complete(results) for results in dict.fromkeys(choice.results for choice in chosen)]
     log, shown_run = _choose_run(used[0], used, log, run)
@@ -155,7 +161,7 @@ def write_side_by_side(
     recording = _reread_truth(sides, log, experiment)
     run_tracks = {side.labels[name]: fused for side in sides for name, fused in side.one.run_tracks.whole().items()}
     table = pd.concat([side.rows.assign(configuration=side.rows["configuration"].map(side.labels)) for side in sides])
-    files = [part.path(path) for part in split_into_files(labels, labels[0])]
+    files = [part.path(path) for part in split_into_files(labels, baselines)]
     for file in files:
         check_output(file)
         remove_leftovers(file)
@@ -169,12 +175,24 @@ def write_side_by_side(
         table.reset_index(drop=True),
         _join_summaries(sides, labels),
         shown_run,
-        run_is=f"differences to {labels[0]}",
-        baseline=labels[0],
+        run_is=f"differences to {name_folders(all_results)[0] if versions else labels[0]}",
+        baselines=baselines,
         of_one=len(used) == 1,
         false_tracks=_join_false_tracks(sides, log, shown_run),
+        colours=_colour_versions(chosen, list(pairs.values())) if versions else None,
     )
     return [f"{path}: {line}" for line in _note_other_worlds(sides)]
+
+
+def _colour_versions(chosen: Sequence[LabelledConfiguration], older: Sequence[LabelledConfiguration]) -> dict[str, Rgb]:
+    """Colours by label: those that configurations have in all files of their experiment; of the older ones paler."""
+    colours: dict[str, Rgb] = {}
+    for one in chosen:
+        truths = [name for name, facts in one.results.facts.items() if facts.truth]
+        own = configuration_colours(one.results.experiment.configurations, truths)
+        red, green, blue = ((a + b) // 2 for a, b in zip(own[one.configuration], REST, strict=True))
+        colours[one.label] = (red, green, blue) if one in older else own[one.configuration]
+    return colours
 
 
 def _replay_sides(used: Sequence[Results], chosen: Sequence[LabelledConfiguration], log: str, run: int) -> list[_Side]:

@@ -11,7 +11,7 @@ import os
 import re
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -410,14 +410,16 @@ class RecordingPart:
         return path.with_name(f"{path.stem}{self.infix}{path.suffix}")
 
 
-def split_into_files(configurations: Sequence[str], baseline: str | None = None) -> list[RecordingPart]:
+def split_into_files(configurations: Sequence[str], baselines: Mapping[str, str] | None = None) -> list[RecordingPart]:
     """All configurations in their order, seven per file: `replay.rrd`, `replay.configurations_8-14.rrd` and so on.
 
-    The baseline of a comparison is in every file, and the first of it.
+    The baseline of all is in every file, and the first of it. Of several baselines each stands before what is held
+    against it, and is in the same file.
     """
-    shared = tuple(name for name in configurations if name == baseline)
-    others = [name for name in configurations if name != baseline]
-    per_file = VIEWED - len(shared)
+    against = {*(baselines or {}).values()}
+    shared = tuple(name for name in configurations if name in against) if len(against) == 1 else ()
+    others = [name for name in configurations if name not in shared]
+    per_file = VIEWED - (VIEWED % 2 if len(against) > 1 else len(shared))
     parts = [RecordingPart((*shared, *others[:per_file]) if shared else tuple(others[:per_file]))]
     for first in range(per_file, len(others), per_file):
         names = others[first : first + per_file]

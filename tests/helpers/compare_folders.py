@@ -134,7 +134,7 @@ def write_folder(
         "format": 6,
         "seed": 1,
         "runs": max(r["run"] for r in rows) + 1,
-        "logs": [{"log": name, "topic": "ground_truth", "sha256": content} for name, content in logs.items()],
+        "logs": [{"log": name, "topic": "ground_truth", "sha256": of, "truth": of} for name, of in logs.items()],
         "visibility": "surface",
         "max_gap_s": 0.5,
         "measure": MEASURE | (measure or {}),

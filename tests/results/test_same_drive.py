@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from copem_replay.experiment.validate import read_logs
 from copem_replay.io.ground_truth import truth_digest
 from copem_replay.results.compare.compare import Comparison, compare_folders
 from copem_replay.viewer.side_by_side import write_side_by_side
-from tests.helpers.compare_folders import unseal
 from tests.helpers.recordings import Obj, Topic, truth_topic, write_mcap
 from tests.helpers.replays import save_run
 from tests.helpers.scenes import Thing, driving, recording, standing
@@ -150,14 +148,3 @@ def test_a_truth_of_another_topic_is_the_same(tmp_path: Path) -> None:
     comparison = compare_folders([one, two], baseline="one:stack")
     assert "the topic of its truth (truth, objects)" in comparison.notes[0]
     assert times(comparison)["two:stack"] == 0
-
-
-def test_results_of_before_are_told_by_their_files(tmp_path: Path) -> None:
-    """Where one folder does not say the digest of the truth it is the file that tells, as it was."""
-    one = results(tmp_path / "one", bag(tmp_path / "1" / "drive.mcap", [0.7]))
-    two = results(tmp_path / "two", bag(tmp_path / "2" / "drive.mcap", [0.4]))
-    said = json.loads((unseal(two) / "provenance.json").read_text())
-    del said["logs"][0]["truth"]
-    (two / "provenance.json").write_text(json.dumps(said))
-    with pytest.raises(InputError, match=r"drive of other content \(SHA-256\)"):
-        compare_folders([one, two], baseline="one:stack")

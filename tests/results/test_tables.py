@@ -51,33 +51,36 @@ def test_all_configurations_are_compared_with_the_ideal(tmp_path):
 
 def test_names_that_several_folders_have_get_the_folders(tmp_path):
     folders = [study(tmp_path, "old", "ideal", "GT", "nms"), study(tmp_path, "new", "GT", "gnn")]
-    comparison = compare_folders(folders)
+    comparison = compare_folders(folders, baseline="ideal")
     assert comparison.baseline == "ideal"
     assert comparison.configurations == ("old:GT", "nms", "new:GT", "gnn")
 
 
 def test_folders_of_one_name_are_told_apart_by_their_paths(tmp_path):
     folders = [study(tmp_path, "a/out", "ideal", "GT"), study(tmp_path, "b/out", "GT")]
-    assert compare_folders(folders).configurations == (f"{folders[0]}:GT", f"{folders[1]}:GT")
+    assert compare_folders(folders, baseline="ideal").configurations == (f"{folders[0]}:GT", f"{folders[1]}:GT")
+    itself = compare_folders(folders)
+    assert (itself.baseline, itself.newer, itself.configurations) == (str(folders[0]), (str(folders[1]),), ("GT",))
 
 
 def test_a_name_that_looks_like_a_folders_is_no_other_ones(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "x", "b:x"), study(tmp_path, "b", "x")]
-    comparison = compare_folders(folders)
+    comparison = compare_folders(folders, baseline="ideal")
     assert len(set(comparison.configurations)) == 3
     assert set(comparison.table["configuration"]) == set(comparison.configurations)
 
 
 def test_a_name_stands_for_all_that_bear_it(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "GT", "nms"), study(tmp_path, "b", "GT", "gnn")]
-    assert compare_folders(folders, configurations=["GT"]).configurations == ("a:GT", "b:GT")
-    assert compare_folders(folders, configurations=["b:GT", "a:nms", "nms"]).configurations == ("b:GT", "nms")
+    ideal = {"baseline": "ideal"}
+    assert compare_folders(folders, configurations=["GT"], **ideal).configurations == ("a:GT", "b:GT")
+    assert compare_folders(folders, configurations=["b:GT", "a:nms", "nms"], **ideal).configurations == ("b:GT", "nms")
     assert compare_folders(folders, configurations=["nms", "gnn"], baseline="b:GT").baseline == "b:GT"
 
 
 def test_a_configurations_own_name_goes_before_that_with_a_folders(tmp_path):
     folders = [study(tmp_path, "a", "ideal", "b:x"), study(tmp_path, "b", "x")]
-    assert compare_folders(folders, configurations=["b:x"]).configurations == ("b:x",)
+    assert compare_folders(folders, configurations=["b:x"], baseline="ideal").configurations == ("b:x",)
 
 
 def test_a_baseline_is_one_configuration(tmp_path):
@@ -162,18 +165,6 @@ def test_a_recorded_output_has_the_ideal_of_its_inputs_as_they_arrived(tmp_path)
     late, ideal = {"units": ["box"], "latency_s": 0.1}, {"units": ["box"]}
     found = chosen(tmp_path, GT=GT, late=late, stack=stack, **{"stack:ideal": ideal})
     assert found == ("stack:ideal", "ideal fusion of the inputs of stack")
-
-
-def test_of_several_folders_the_first_with_an_ideal_has_the_baseline(tmp_path):
-    def folder(name: str, **configurations: dict[str, Any]) -> Path:
-        return study(tmp_path, name, *configurations, experiment={"units": UNITS, "configurations": configurations})
-
-    none, one, other = folder("none", PEM=EGO), folder("one", co=BOTH, x=BOTH | GNN), folder("other", ideal=BOTH)
-    assert compare_folders([none, one]).baseline == "co"
-    assert compare_folders([one, none, other]).baseline == "ideal"
-    assert compare_folders([none, folder("two", PEM=EGO)]).baseline == "none:PEM"
-    again = study(tmp_path, "again", "ideal", "GT")
-    assert compare_folders([again, other]).baseline == "again:ideal"
 
 
 def test_the_baseline_is_said_in_a_line_unless_it_was_asked_for(tmp_path):

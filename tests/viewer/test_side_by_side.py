@@ -7,6 +7,7 @@ starts. In folder `a` it sees to 55 m, half a metre off (0.3 east, 0.4 north): i
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from copem_replay.cli import main as cli
 from copem_replay.core.colours import configuration_colours
 from copem_replay.experiment.schema import Experiment
 from copem_replay.viewer.side_by_side import ComparedExperiment, join_experiments
-from copem_replay.viewer.sink import ELAPSED
+from copem_replay.viewer.sink import ELAPSED, split_into_files
 from tests.helpers.compare_folders import unseal
 from tests.helpers.experiments import changed, drive
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -116,6 +117,69 @@ def test_two_folders_beside_each_other(call: Compare, tmp_path: Path) -> None:
     # An existing file is replaced, as the tables of `compare` are.
     assert call(*asked, "--run", "1", "--log", "drive")[0] == 0
     assert at(path, r"/world/a\:PEM/boxes", 2.0)["Boxes3D:centers"] != []
+
+
+def test_an_older_version_and_a_newer_one(call: Compare, tmp_path: Path) -> None:
+    """Each configuration beside itself: the newer one in its own colour, the older one in a paler one."""
+    code, lines = call("compare", "a", "b", "--rrd", "ab.rrd")
+    assert code == 0
+    assert lines[:1] == [
+        "note: b differs from a in pems.onboard.0.when.range_m ([0.0, 55.0], [0.0, 80.0]); "
+        "pems.onboard.0.error.mean_m ([0.3, 0.4], [0.0, 0.0])"
+    ]
+    path = tmp_path / "ab.rrd"
+    entities = {chunk.entity_path.replace("\\", "") for chunk in _all(path)}
+    drawn = {entity.split("/")[2] for entity in entities if entity.startswith("/world/") and entity.endswith("/boxes")}
+    assert {"a:PEM", "b:PEM"} <= drawn
+    assert not any(":GT" in name for name in drawn), "nothing differs in it"
+    (told,) = rows(path, r"/events/difference/b\:PEM")
+    assert (told[ELAPSED], told["TextLog:text"]) == (1_500_000_000, ["b:PEM knew 2 car 0.50 s before a:PEM"])
+    assert not any("a:PEM/difference" in entity for entity in entities)
+    assert "2 car: more error than before, m" in {view.partition(" · ")[0] for view in _views(path)}
+    assert call("compare", "b", "--baseline", "GT", "--rrd", "own.rrd")[0] == 0
+    own, newer, older = (
+        static(of, entity)["SeriesLines:colors"]
+        for of, entity in (
+            (tmp_path / "own.rrd", "/plots/known/PEM"), (path, r"/plots/known/b\:PEM"),
+            (path, r"/plots/known/a\:PEM"),
+        )
+    )  # fmt: skip
+    assert newer == own != older
+
+
+def test_pairs_stay_in_one_file() -> None:
+    pairs = {f"new:{k}": f"old:{k}" for k in range(4)}
+    names = [name for new, old in pairs.items() for name in (old, new)]
+    first, second = split_into_files(names, pairs)
+    assert (first.configurations, second.configurations) == (tuple(names[:6]), tuple(names[6:]))
+    assert second.infix == ".configurations_7-8"
+
+
+def test_what_of_two_versions_fails(
+    call: Compare, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`far` knows the car half a second before `near`: the older folder comes first."""
+    for name, of in (("near", text(55, [0.3, 0.4])), ("far", text(80, [0.0, 0.0]))):
+        (tmp_path / f"{name}.yaml").write_text(of.replace("runs: 2", "runs: 6"))
+        assert call("run", f"{name}.yaml", "--out", name)[0] == 0
+    limit = ("--fail-on", "ttd_rmst_s > 0.05", "--configurations", "PEM")
+    for words, expected, code in ((("near", "far"), "better: PEM 0.50 s sooner", 0),
+                                  (("far", "near"), "worse: PEM 0.50 s later", 1)):  # fmt: skip
+        monkeypatch.setattr("sys.argv", ["copem-replay", "compare", *words, *limit])
+        assert cli._run_to_exit_code() == code
+        said = capsys.readouterr().out.splitlines()
+        assert said[0] == f"{words[1]} against {words[0]}: {expected.partition(':')[0]}"
+        assert said[-1].startswith(f"{words[1]} against {words[0]}: {expected}")
+        monkeypatch.setattr("sys.argv", ["copem-replay", "compare", *words, *limit, "--json"])
+        assert cli._run_to_exit_code() == code
+        found = json.loads(capsys.readouterr().out)
+        assert (found["answer"], found["newer"]) == (said[-1], [words[1]])
+        assert {row["configuration"] for row in found["rows"]} == {"PEM"}
+        (time,) = (row for row in found["rows"] if row["metric"] == "ttd_rmst_s")
+        assert abs(time["difference"]) == pytest.approx(0.5)
+    assert call("compare", "near", *limit) == (
+        2, ["--fail-on: expected two folders, OLD NEW, or --baseline NAME, found 1"]
+    )  # fmt: skip
 
 
 def _all(path: Path) -> list[Any]:

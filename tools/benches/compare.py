@@ -115,7 +115,7 @@ def write_provenance(folder: Path, names: Sequence[str], logs: Sequence[str]) ->
         ideal=None, ideal_of=None, remembering=None,
     )  # fmt: skip
     said["configurations"] = dict.fromkeys(names, asdict(drawn))
-    said["logs"] = [{"log": log, "topic": None, "sha256": log} for log in logs]
+    said["logs"] = [{"log": log, "topic": None, "sha256": log, "truth": log} for log in logs]
     (folder / "provenance.json").write_text(json.dumps(said))
 
 

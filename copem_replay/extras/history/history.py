@@ -26,7 +26,6 @@ from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join
 from copem_replay.report.html.page import REPORT, check_report, section_links, whole_page
 from copem_replay.report.html.tables import VERDICT_SIGNS, verdict_mark
 from copem_replay.results.compare import compare_folders
-from copem_replay.results.compare.labels import label_configurations
 from copem_replay.results.outputs import made_file
 from copem_replay.results.read import Results, open_results
 from copem_replay.results.verdicts import (
@@ -282,7 +281,7 @@ def _side_by_side(folders: Sequence[JudgedFolder], turned: dict[_Key, list[tuple
     parts = []
     for k in numbers:
         new, old = folders[k], folders[k - 1]
-        command = f"copem-replay compare {new.results.place} {old.results.place}"
+        command = f"copem-replay compare {old.results.place} {new.results.place}"
         table = fold_parts(f"{new.label} minus {old.label}", _difference_table(new, old), make_tag("code", command))
         parts.append(Html(table.replace("<details>", "<details open>", 1)) if k == numbers[0] else table)
     return join_html(parts)
@@ -305,15 +304,12 @@ def _difference_table(new: JudgedFolder, old: JudgedFolder) -> Html:
 
 def _difference_rows(new: Results, old: Results) -> Iterator[tuple[str, list[pd.Series]]]:
     """By configuration that both have, the rows of a comparison of the new one with the old one."""
-    labels = {(one.results, one.configuration): one.label for one in label_configurations([new, old])}
-    for name in new.facts:
-        if name not in old.facts:
-            continue
-        comparison = compare_folders(
-            [new, old], configurations=[labels[new, name]], baseline=labels[old, name],
-            metrics=("detected_share", "ttd_rmst_s", "unknown_to_horizon_s", "pass_share", SHARE),
-        )  # fmt: skip
-        yield name, [row for _, row in comparison.overall.iterrows()]
+    if not new.facts.keys() & old.facts.keys():
+        return
+    metrics = ("detected_share", "ttd_rmst_s", "unknown_to_horizon_s", "pass_share", SHARE)
+    overall = compare_folders([old, new], metrics=metrics).overall
+    for name, rows in overall.groupby("configuration", sort=False):
+        yield str(name), [row for _, row in rows.iterrows()]
 
 
 def _difference_words(row: pd.Series | None) -> Html:

@@ -1,5 +1,7 @@
 """The comparison of configurations with a baseline, on the same logs, objects and runs, within or across folders.
 
+Each configuration has its own baseline: one for all, or itself in an older folder.
+
 Folders are checked for what they must have in common: the recordings, the random numbers, and what is measured how.
 Logs are read one by one, so that no rows are kept but their sums.
 """
@@ -10,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +36,19 @@ from copem_replay.metrics.summary_metrics import COMPARED, OF_LISTS
 from copem_replay.results.compare.groups import EpisodeGroups, without_limits_over_runs
 from copem_replay.results.compare.labels import (
     LabelledConfiguration,
+    Pairs,
     check_comparable,
     check_log_names,
-    choose_baseline,
-    choose_configurations,
+    find_baseline,
     find_remembering,
     label_configurations,
+    name_folders,
     notes_on_differences,
     notes_on_folders,
+    notes_on_missing,
     notes_on_output_baseline,
     notes_on_remembering,
+    pair_configurations,
     rename_logs,
 )
 from copem_replay.results.compare.limits import (
@@ -85,24 +90,20 @@ from copem_replay.results.table_files import AGAIN
 @dataclass
 class AllLogs:
     """The sums of a pair, log by log: `alone`: rows that only one side has, (first, second); `differences`: by metric,
-    of each log that has one.
+    of each log that has one. `same`: whether both sides have the same rows.
     """
 
     alone: list[tuple[int, int]] = field(default_factory=list)
     differences: dict[str, list[float]] = field(default_factory=dict)
+    same: bool = True
     _regrets: dict[str, list[Regret]] = field(default_factory=dict)
 
     def add(
-        self,
-        first: PairSide,
-        second: PairSide,
-        regrets: Sequence[Regret],
-        *,
-        more: bool,
-        over_runs: bool = False,
+        self, first: PairSide, second: PairSide, regrets: Sequence[Regret], *, more: bool, over_runs: bool = False
     ) -> None:
         """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
+        self.same = self.same and first.has_rows_of(second)
         for regret in regrets:
             # Runs and passes stay apart for a single object: they are the clusters if no log has another.
             runs = over_runs or regret.counts[0][0] <= 1
@@ -142,9 +143,7 @@ class PairsAsked:
 
     def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
         """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
-        counted = (
-            side.there & (side.rows["ended_s"] - side.rows["onset_s"] > SAME_INSTANT_S) if self.every else side.counted
-        )
+        counted = side.counted_however_begun if self.every else side.counted
         if self.episodes is None or (kept := self.episodes.get(log, ())) is None:
             return replace(side, counted=counted)
         asked = np.repeat(np.array([episode in kept for episode in grid.episodes], dtype=bool), grid.runs)
@@ -168,7 +167,9 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
             continue
         seen[place] = path
         try:
-            folders.append(_read_folder(folder))
+            results = folder if isinstance(folder, Results) else open_results(folder)
+            folders.append(results)
+            results.source, results.by_log  # noqa: B018  # damage is found here
         except InputError as error:
             problems += error.problems
     if problems:
@@ -178,20 +179,13 @@ def read_folders(given: Sequence[Path | Results]) -> list[Results]:
     return folders
 
 
-def _read_folder(folder: Path | Results) -> Results:
-    results = folder if isinstance(folder, Results) else open_results(folder)
-    results.source  # noqa: B018
-    results.by_log  # noqa: B018  # damage is found here
-    return results
-
-
 # Notes on a comparison: what is left out, and why.
 
 
-def notes_on_pairs(baseline: LabelledConfiguration, pairs: Mapping[LabelledConfiguration, AllLogs]) -> Iterator[str]:
+def notes_on_pairs(pairs: Pairs, sums: Mapping[LabelledConfiguration, AllLogs]) -> Iterator[str]:
     """Notes on rows without a partner."""
-    for labelled, pair in pairs.items():
-        counts = np.sum(pair.alone, axis=0).tolist()
+    for labelled, baseline in pairs.items():
+        counts = np.sum(sums[labelled].alone, axis=0).tolist()
         for (one_side, other), count in zip(((labelled, baseline), (baseline, labelled)), counts, strict=True):
             if count:
                 yield f"{count_noun(count, 'row')} of {one_side.label} left out: {other.label} has no such object"
@@ -212,7 +206,10 @@ _FEW_HAVE_IT = (
 
 
 def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
-    """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute."""
+    """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute.
+
+    None: than their baselines.
+    """
     counts = [of.counts for of in pairs]
     none = [count for count in counts if count[0] and choose_over(*count) is None]
     why = f"{explain_no_clusters(*none[0])}; {NOT_ENOUGH}" if none else None
@@ -234,7 +231,8 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
         listed = (f"{row.metric} of {row.configuration} {row.difference_without_it:+.3g}" for row in rows.itertuples())
         yield f"hangs on log {log}; without it: {', '.join(listed)}"
     ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
-    fewer = ghosts[ghosts["ghosts_kept_per_min"] < asked * (1 - 1e-9)] if asked is not None else ghosts[:0]
+    rates = ghosts["baseline_ghosts_kept_per_min"] if asked is None else asked
+    fewer = ghosts[ghosts["ghosts_kept_per_min"] < rates * (1 - 1e-9)]
     for rate, rows in fewer.groupby("ghosts_kept_per_min", sort=False):
         yield (
             f"{', '.join(rows['configuration'])}: all entries make only {rate:.4g} ghosts per minute: "
@@ -256,6 +254,9 @@ class Comparison:
     `group` in place of the log; None: not asked for. `truths`: labels of the ground truth. `decide`: the one metric
     that was named to decide; None: all. `matters`: by metric the least difference that matters.
 
+    Of several folders without a baseline that is asked for, each configuration is held against itself in the first
+    one, whose name is `baseline`. `newer`: names of the others. `unchanged`: configurations whose rows are the same.
+
     >>> comparison = cr.compare("out/tc016d", baseline="PEM")
     >>> comparison.baseline, comparison.configurations
     ('PEM', ('GT', 'coPEM:0s', 'coPEM:0.5s', 'coPEM:1s', 'coPEM:1.5s'))
@@ -272,6 +273,15 @@ class Comparison:
     truths: tuple[str, ...] = ()
     decide: str | None = None
     matters: Mapping[str, float] = field(default_factory=dict)
+    newer: tuple[str, ...] = ()
+    unchanged: tuple[str, ...] = ()
+
+    @property
+    def changed(self) -> Comparison:
+        """Without the configurations that are unchanged."""
+        names = tuple(name for name in self.configurations if name not in self.unchanged)
+        table, groups = (of if of is None else of[of["configuration"].isin(names)] for of in (self.table, self.groups))
+        return replace(self, configurations=names, table=table, groups=groups)
 
     @property
     def overall(self) -> pd.DataFrame:
@@ -280,72 +290,74 @@ class Comparison:
 
 
 def compare_folders(
-    folders: Sequence[Path | Results],
-    *,
-    configurations: Sequence[str] | None = None,
-    baseline: str | None = None,
-    false_positives_per_min: float | None = None,
-    metrics: Sequence[str] | None = None,
-    by: Sequence[str] | None = None,
-    asked: PairsAsked = PairsAsked(),
-    decide: str | None = None,
+    folders: Sequence[Path | Results], *, configurations: Sequence[str] | None = None, baseline: str | None = None,
+    false_positives_per_min: float | None = None, metrics: Sequence[str] | None = None,
+    by: Sequence[str] | None = None, asked: PairsAsked = PairsAsked(), decide: str | None = None,
     matters: Mapping[str, float] | None = None,
-) -> Comparison:
-    """Compare configurations (None: all) with a baseline, pair by pair, in some metrics (None: all).
+) -> Comparison:  # fmt: skip
+    """Compare configurations (None: all) with their baselines, pair by pair, in some metrics (None: all).
 
-    `by`: entries by which each group is compared for itself, too. `decide`: only this metric is to have a star.
-    `matters`: by metric the least difference that matters, which gives each a word.
-
-    `baseline`: None: the configuration named `ideal`, else the ideal fusion of the same inputs, else the first that is
-    not the truth. `false_positives_per_min`: at which times to detection are compared once more; None: as many as the
-    baseline has. Raises InputError, a line for every reason why something cannot be read or compared.
+    The others as in `compare` of the API. Raises InputError, a line for every reason why something cannot be read or
+    compared.
     """
     _check_rate(false_positives_per_min)
     _check_named(decide, matters or {})
     read = read_folders(folders)
     check_comparable(read)
     read, renames = rename_logs(read)
-    known = label_configurations(read)
-    against, *others = choose_configurations(known, configurations, baseline)
-    check_log_names(against, others, renames)
-    used = list(dict.fromkeys(labelled.results for labelled in (against, *others)))
+    pairs = pair_configurations(read, configurations, baseline)
+    check_log_names(pairs, renames)
+    older, *newer = name_folders(read) if baseline is None and len(read) > 1 else [""]
+    if len(newer) == 1:  # the name alone says which one it is
+        pairs = {replace(labelled, label=labelled.configuration): other for labelled, other in pairs.items()}
+    sides = list(dict.fromkeys(labelled for pair in pairs.items() for labelled in reversed(pair)))  # baselines first
+    used = list(dict.fromkeys(labelled.results for labelled in sides))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
-    own_rate = false_positives_per_min is None
-    of_ghosts = not own_rate or "thresholds.parquet" in list_tables(metrics)
-    totals = ghost_totals((against, *others), logs, runs) if of_ghosts else {}
-    if own_rate and against in totals:
-        false_positives_per_min = totals[against].per_min
     horizon_s, horizon_notes = _settle_horizon(used)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
-    settings, reasons = _settle_ghosts(setting, against, others, totals, false_positives_per_min, asked=not own_rate)
+    of_ghosts = false_positives_per_min is not None or "thresholds.parquet" in list_tables(metrics)
+    totals = ghost_totals(sides, logs, runs) if of_ghosts else {}
+    settings, reasons = _settle_ghosts(setting, pairs, totals, false_positives_per_min)
+    if false_positives_per_min is None and not newer and sides[0] in totals:
+        false_positives_per_min = totals[sides[0]].per_min
     groups = EpisodeGroups(read[0], by or ())
     asked = replace(asked, weigh=asked.weigh or read[0].provenance.measure.get("weigh", OBJECTS))
-    names = ClusterNames(logs, [], runs)
-    remembering = find_remembering(known, against, others) if baseline is None else {}
-    stars = Stars(decide, matters or {})
-    pairs, rows, of_groups = _compare_each_log(against, settings, names, metrics, groups, asked, remembering, stars)
-    table = COMPARISON.frame(rows)
+    remembering = find_remembering(label_configurations(read), pairs) if baseline is None and not newer else {}
+    pair_rows = PairRows(pairs, remembering, ClusterNames(logs, [], runs), asked)
+    sums, of_logs, of_groups = _compare_each_log(pair_rows, settings, metrics, groups)
+    rows, limit = pair_rows.of_all_logs(sums)
+    moved = {row["configuration"] for row in rows if row["difference"]}
+    same = [one.label for one in pairs if newer and sums[one].same and one.label not in moved]
+    stars = Stars(decide, matters or {}, same)
+    stars.mark(rows, limit)
+    table = COMPARISON.frame([*rows, *of_logs])
+    why = "each configuration against itself there" if newer else None
+    if not newer and baseline is None:
+        why = find_baseline(read[0].facts, [sides[0].configuration, *(one.configuration for one in pairs)]).why
     return Comparison(
         table=table,
-        baseline=against.label,
-        baseline_why=choose_baseline(known)[1] if baseline is None else None,
-        configurations=tuple(labelled.label for labelled in others),
+        baseline=older or sides[0].label,
+        baseline_why=why,
+        configurations=tuple(labelled.label for labelled in pairs),
         horizon_s=setting.horizon_s,
         false_positives_per_min=false_positives_per_min,
-        groups=_tabulate_groups(against, remembering, of_groups, names, groups, stars, asked.weigh) if by else None,
+        groups=_tabulate_groups(pair_rows, of_groups, groups, stars) if by else None,
         decide=decide,
         matters=matters or {},
-        truths=tuple(labelled.label for labelled in (against, *others) if labelled.facts.truth),
+        truths=tuple(labelled.label for labelled in sides if labelled.facts.truth),
+        newer=tuple(newer),
+        unchanged=tuple(same),
         notes=(
             *notes_on_folders(used),
             *horizon_notes,
             *notes_on_differences(used, renames),
-            *notes_on_pairs(against, pairs),
-            *notes_on_output_baseline(against, others),
+            *(notes_on_missing(read) if newer and configurations is None else ()),
+            *notes_on_pairs(pairs, sums),
+            *notes_on_output_baseline(pairs),
             *notes_on_remembering(remembering),
             *notes_on_frames(table),
             *notes_on_equal_ghosts(reasons),
-            *notes_on_rows(table, pairs.values(), false_positives_per_min),
+            *notes_on_rows(table, sums.values(), false_positives_per_min),
         ),
     )
 
@@ -372,15 +384,17 @@ def _check_named(decide: str | None, matters: Mapping[str, float]) -> None:
 class Stars:
     """How the stars of a table are held: over all its differences, or those of the metric that was named to `decide`.
 
-    `matters`: by metric the least difference that matters.
+    `matters`: by metric the least difference that matters. `without`: configurations of which nothing can differ.
     """
 
     decide: str | None
     matters: Mapping[str, float]
+    without: Sequence[str] = ()
 
     def mark(self, rows: Sequence[dict[str, Any]], limit: Sequence[Callable[[float], Mapping[str, object]]]) -> None:
         """Give rows, of one table, the columns `star` and `word`; `limit`: of each its limits at a confidence."""
-        asked = [k for k, row in enumerate(rows) if self.decide in (None, row["metric"])]
+        may_differ = (k for k, row in enumerate(rows) if row["configuration"] not in self.without)
+        asked = [k for k in may_differ if self.decide in (None, rows[k]["metric"])]
         number = sum(rows[k]["difference"] is not None for k in asked)
         alone = {k for k, row in enumerate(rows) if is_off_zero(row)}
         may = [k for k in asked if k in alone]
@@ -392,92 +406,75 @@ class Stars:
 
 
 def _settle_ghosts(
-    setting: PairSettings,
-    against: LabelledConfiguration,
-    others: Sequence[LabelledConfiguration],
-    totals: Mapping[LabelledConfiguration, GhostTotals],
-    per_min: float | None,
-    *,
-    asked: bool,
+    setting: PairSettings, pairs: Pairs, totals: Mapping[LabelledConfiguration, GhostTotals], asked: float | None
 ) -> tuple[dict[LabelledConfiguration, PairSettings], dict[str, str | None]]:
     """The settings of each pair, with operating points at equal ghosts; by label why there are none, None: there are.
 
-    `asked`: whether the user asked for the rate `per_min`; else it is that of the baseline.
+    `asked`: ghosts per minute that the user asked for; None: those of each baseline.
     """
     settings, reasons = {}, {}
-    for labelled in others:
+    for labelled, against in pairs.items():
         both = totals.get(labelled), totals.get(against)
-        why = explain_incomparable(*both, per_min, asked=asked, truth=against.facts.truth)
+        per_min = both[1].per_min if asked is None and both[1] is not None else asked
+        why = explain_incomparable(*both, per_min, asked=asked is not None, truth=against.facts.truth)
         kept = None if why is not None else find_operating_points(*both, per_min)
         reasons[labelled.label], settings[labelled] = why, replace(setting, kept=kept)
     return settings, reasons
 
 
-def _compare_each_log(
-    against: LabelledConfiguration,
-    settings: Mapping[LabelledConfiguration, PairSettings],
-    names: ClusterNames,
-    metrics: Sequence[str] | None,
-    groups: EpisodeGroups,
-    asked: PairsAsked,
-    remembering: Remembering,
-    stars: Stars,
-) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:
-    """The sums of each pair over the logs of `names`; rows of all logs, then of each log where there are several; the
-    sums of each group.
+GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
+"""Sums of pairs by group."""
 
-    The objects of the logs are appended to `names`.
+
+def _compare_each_log(
+    pair_rows: PairRows, settings: Mapping[LabelledConfiguration, PairSettings], metrics: Sequence[str] | None,
+    groups: EpisodeGroups,
+) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:  # fmt: skip
+    """The sums of each pair over the logs; rows of each log where there are several; the sums of each group.
+
+    The objects of the logs are appended to the names of clusters.
     """
-    logs, pairs, of_groups = names.logs, {labelled: AllLogs() for labelled in settings}, GroupPairs()
+    names, asked, pairs, remembering = pair_rows.names, pair_rows.asked, pair_rows.pairs, pair_rows.remembering
+    logs, sums, of_groups = names.logs, {labelled: AllLogs() for labelled in pairs}, GroupPairs()
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
             results: results.rows_of(log, list_tables(metrics))
-            for results in dict.fromkeys(labelled.results for labelled in (against, *pairs))
+            for results in dict.fromkeys(labelled.results for labelled in (*pairs.values(), *pairs))
         }
         detections = (of_folder["detections.parquet"] for of_folder in tables.values())
         grid = build_grid(k, detections, names.runs, len(names.objects))
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
-        second, *remembered = (
-            asked.restrict(log, grid, lay_out_configuration(one, tables[one.results], grid))
-            for one in (against, *remembering.values())
-        )
-        held_against = dict(zip(remembering, remembered, strict=True))
-        for labelled, pair in pairs.items():
-            first = asked.restrict(log, grid, lay_out_configuration(labelled, tables[labelled.results], grid))
+
+        def lay_out(one: LabelledConfiguration, log: str = log, grid: PairingGrid = grid, of: Any = tables) -> PairSide:
+            return asked.restrict(log, grid, lay_out_configuration(one, of[one.results], grid))
+
+        # What several are held against is laid out once, what one is held against is gone after it.
+        lay_out_baseline = lru_cache(1 + len({*remembering.values()}))(lay_out)
+        for labelled, against in pairs.items():
+            second, first = lay_out_baseline(against), lay_out(labelled)
+            held = lay_out_baseline(remembering[labelled]) if labelled in remembering else None
             _check_same_episodes(labelled, first, against, second, log, grid)
             _check_same_frames(labelled, first, against, second, log)
-            regrets = _compute_regrets(first, second, held_against.get(labelled), grid, settings[labelled], metrics)
-            pair.add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
+            regrets = _compute_regrets(first, second, held, grid, settings[labelled], metrics)
+            sums[labelled].add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
             for regret in regrets if len(logs) > 1 else ():
                 values = regret.figure.values()
-                pair.differences.setdefault(regret.metric, []).append(values[2])
-                baseline = _baseline_of(regret.metric, labelled, against, remembering)
-                rows.append({"log": log, **_make_row(regret, values, labelled, baseline, names, asked)})
+                sums[labelled].differences.setdefault(regret.metric, []).append(values[2])
+                rows.append({"log": log, **pair_rows.make(labelled, regret, values)})
             for group, kept in groups.select(log, grid):
                 one, other = (groups.restrict(group, kept, side) for side in (first, second))
-                held = held_against.get(labelled)
-                held = None if held is None else groups.restrict(group, kept, held)
-                regrets = _compute_regrets(one, other, held, grid, settings[labelled], metrics)
+                beside = None if held is None else groups.restrict(group, kept, held)
+                regrets = _compute_regrets(one, other, beside, grid, settings[labelled], metrics)
                 of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
                 of_pair.add(one, other, regrets, more=len(logs) > 1)
-    overall, limit = _overall_rows(against, remembering, pairs, names, asked)
-    stars.mark(overall, limit)
-    return pairs, [*overall, *rows], of_groups
-
-
-Remembering = Mapping[LabelledConfiguration, LabelledConfiguration]
-"""The ideal fusions with memory that accuracy is held against, by configuration."""
+    return sums, rows, of_groups
 
 
 def _compute_regrets(
-    first: PairSide,
-    second: PairSide,
-    remembered: PairSide | None,
-    grid: PairingGrid,
-    setting: PairSettings,
+    first: PairSide, second: PairSide, remembered: PairSide | None, grid: PairingGrid, setting: PairSettings,
     metrics: Sequence[str] | None,
-) -> list[Regret]:
+) -> list[Regret]:  # fmt: skip
     """The metrics of a log; what is held against what is `remembered`, None: as all others against the second side."""
     regrets = list(compute_regrets(first, second, grid, setting, metrics))
     if remembered is None:
@@ -487,31 +484,13 @@ def _compute_regrets(
     return [held.get(regret.metric, regret) for regret in regrets]
 
 
-def _baseline_of(
-    metric: str, labelled: LabelledConfiguration, against: LabelledConfiguration, remembering: Remembering
-) -> LabelledConfiguration:
-    """What a configuration is held against in a metric."""
-    return remembering.get(labelled, against) if metric in HELD_METRICS else against
-
-
-GroupPairs = dict[int, dict[LabelledConfiguration, AllLogs]]
-"""Sums of pairs by group."""
-
-
-def _tabulate_groups(
-    against: LabelledConfiguration,
-    remembering: Remembering,
-    of_groups: GroupPairs,
-    names: ClusterNames,
-    groups: EpisodeGroups,
-    stars: Stars,
-    weigh: str | None,
-) -> pd.DataFrame:
+def _tabulate_groups(pair_rows: PairRows, of_groups: GroupPairs, groups: EpisodeGroups, stars: Stars) -> pd.DataFrame:
     """The rows of `Comparison.groups`; those of an entry are one table."""
     rows: list[dict[str, Any]] = []
     limit: list[Callable[[float], Mapping[str, object]]] = []
+    of_group = replace(pair_rows, asked=PairsAsked(weigh=pair_rows.asked.weigh))
     for k, (by, group) in enumerate(groups.named):
-        found, of_found = _overall_rows(against, remembering, of_groups.get(k, {}), names, PairsAsked(weigh=weigh))
+        found, of_found = of_group.of_all_logs(of_groups.get(k, {}))
         rows += [{"by": by.label, "group": group, **without_limits_over_runs(row)} for row in found]
         limit += of_found
     for label in {row["by"] for row in rows}:
@@ -523,48 +502,81 @@ def _tabulate_groups(
     return table
 
 
-def _overall_rows(
-    against: LabelledConfiguration,
-    remembering: Remembering,
-    pairs: Mapping[LabelledConfiguration, AllLogs],
-    names: ClusterNames,
-    asked: PairsAsked,
-) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
-    """The rows of all logs, and of each its limits at a confidence.
+@dataclass(frozen=True)
+class PairRows:
+    """The rows of pairs: what each configuration is held against, in accuracy what it is `remembering`."""
 
-    Of intervals over logs: how many logs are better, and on which the difference hangs.
-    """
-    rows: list[dict[str, Any]] = []
-    limit: list[Callable[[float], Mapping[str, object]]] = []
-    for labelled, pair in pairs.items():
-        for regret in pair.regrets(asked.weigh):
-            values = regret.figure.values()
-            baseline = _baseline_of(regret.metric, labelled, against, remembering)
-            row: dict[str, Any] = {"log": ALL, **_make_row(regret, values, labelled, baseline, names, asked)}
-            if row.get("interval_over") == "logs":
-                row["logs_better"] = pair.count_better(regret.metric)
-                if (decisive := find_decisive_log(regret.figure, values[2], names)) is not None:
-                    row["hangs_on"], row["difference_without_it"] = decisive[0], _number_or_none(decisive[1])
-            rows.append(row)
-            limit.append(partial(_limit_difference, regret, values[2], (labelled, baseline), names, asked))
-    return rows, limit
+    pairs: Pairs
+    remembering: Pairs
+    names: ClusterNames
+    asked: PairsAsked
+
+    def of_all_logs(
+        self, sums: Mapping[LabelledConfiguration, AllLogs]
+    ) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
+        """The rows of all logs, and of each its limits at a confidence.
+
+        Of intervals over logs: how many logs are better, and on which the difference hangs.
+        """
+        rows: list[dict[str, Any]] = []
+        limit: list[Callable[[float], Mapping[str, object]]] = []
+        for labelled, pair in sums.items():
+            for regret in pair.regrets(self.asked.weigh):
+                values = regret.figure.values()
+                row: dict[str, Any] = {"log": ALL, **self.make(labelled, regret, values)}
+                if row.get("interval_over") == "logs":
+                    row["logs_better"] = pair.count_better(regret.metric)
+                    if (decisive := find_decisive_log(regret.figure, values[2], self.names)) is not None:
+                        row["hangs_on"], row["difference_without_it"] = decisive[0], _number_or_none(decisive[1])
+                rows.append(row)
+                limit.append(partial(self._limit, labelled, regret, values[2]))
+        return rows, limit
+
+    def make(
+        self, labelled: LabelledConfiguration, regret: Regret, values: tuple[float, float, float]
+    ) -> dict[str, object]:
+        """The row of a regret with its `values`, of one log or all."""
+        figure, (value, baseline_value, difference) = regret.figure, map(_number_or_none, values)
+        row: dict[str, object] = {
+            "configuration": labelled.label, "baseline": self._baseline_of(labelled, regret.metric).label,
+            "metric": regret.metric, "value": value, "baseline_value": baseline_value,
+            "n": int(figure.items["n"].sum()), "difference": difference, "star": None, "word": None,
+        }  # fmt: skip
+        row |= self._limit(labelled, regret, values[2], self.asked.confidence)
+        if "only" in figure.items.columns:
+            only = figure.items["only"].sum(axis=0)
+            row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
+        if figure.share and len(figure.items["n"]):
+            row["p_value"] = mcnemar_p_value(*map(int, figure.items["only"].sum(axis=0)))
+        if regret.held is not None:
+            row |= regret.held.columns()
+        if regret.kept is not None:
+            for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
+                row |= {f"{name}existence": kept.existence, f"{name}ghosts_kept_per_min": kept.false_positives_per_min}
+        return row
+
+    def _baseline_of(self, labelled: LabelledConfiguration, metric: str) -> LabelledConfiguration:
+        """What a configuration is held against in a metric."""
+        return self.remembering.get(labelled, self.pairs[labelled]) if metric in HELD_METRICS else self.pairs[labelled]
+
+    def _limit(
+        self, labelled: LabelledConfiguration, regret: Regret, difference: float, confidence: float
+    ) -> dict[str, object]:
+        """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
+        over, sides = "runs" if self.asked.over_runs else regret.over, (labelled, self._baseline_of(labelled, regret.metric))
+        what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
+        fixed = all(getattr(side.facts, what) for side in sides)
+        limits = difference_limits(regret.figure, difference, over, self.names, fixed=fixed, confidence=confidence)
+        sign = COMPARED[regret.metric].better * (_is_never_worse(*sides) - _is_never_worse(*sides[::-1]))
+        if sign * difference < 0 or regret.metric not in _IN_TIME or not sign:
+            return limits
+        least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
+        ends: dict[str, Any] = {name: limits.get(name) for name in ("low", "high", "low_bounded", "high_bounded")}
+        return limits | {name: min(max(end, least), most) for name, end in ends.items() if end is not None}
 
 
-def _limit_difference(
-    regret: Regret, difference: float, sides: tuple[LabelledConfiguration, LabelledConfiguration], names: ClusterNames,
-    asked: PairsAsked, confidence: float,
-) -> dict[str, object]:  # fmt: skip
-    """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
-    over = "runs" if asked.over_runs else regret.over
-    what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
-    fixed = all(getattr(side.facts, what) for side in sides)
-    limits = difference_limits(regret.figure, difference, over, names, fixed=fixed, confidence=confidence)
-    sign = COMPARED[regret.metric].better * (_is_never_worse(*sides) - _is_never_worse(*sides[::-1]))
-    if sign * difference < 0 or regret.metric not in _IN_TIME or not sign:
-        return limits
-    least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
-    ends: dict[str, Any] = {name: limits.get(name) for name in ("low", "high", "low_bounded", "high_bounded")}
-    return limits | {name: min(max(end, least), most) for name, end in ends.items() if end is not None}
+def _number_or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 _IN_TIME = ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s")
@@ -589,13 +601,9 @@ def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
 
 
 def _check_same_episodes(
-    labelled: LabelledConfiguration,
-    first: PairSide,
-    against: LabelledConfiguration,
-    second: PairSide,
-    log: str,
+    labelled: LabelledConfiguration, first: PairSide, against: LabelledConfiguration, second: PairSide, log: str,
     grid: PairingGrid,
-) -> None:
+) -> None:  # fmt: skip
     """Raise InputError where an episode begins or ends at another instant, so that its rows are no pair."""
     if labelled.results is against.results:
         return
@@ -612,11 +620,7 @@ def _check_same_episodes(
 
 
 def _check_same_frames(
-    labelled: LabelledConfiguration,
-    first: PairSide,
-    against: LabelledConfiguration,
-    second: PairSide,
-    log: str,
+    labelled: LabelledConfiguration, first: PairSide, against: LabelledConfiguration, second: PairSide, log: str
 ) -> None:
     """Raise InputError where what is held is told at other frames, so that its values are no pairs."""
     both = first.there & second.there
@@ -632,38 +636,3 @@ def _check_same_frames(
             f"{labelled.results.place}: log {log}: {labelled.configuration}: expected the frames of "
             f"{against.configuration} in {against.results.place}, found others; {AGAIN}"
         )
-
-
-def _make_row(
-    regret: Regret,
-    values: tuple[float, float, float],
-    labelled: LabelledConfiguration,
-    against: LabelledConfiguration,
-    names: ClusterNames,
-    asked: PairsAsked,
-) -> dict[str, object]:
-    """The row of a regret with its `values`, of one log or all."""
-    figure, (value, baseline_value, difference) = regret.figure, values
-    row: dict[str, object] = {"configuration": labelled.label, "baseline": against.label, "metric": regret.metric}
-    row |= {
-        "value": _number_or_none(value),
-        "baseline_value": _number_or_none(baseline_value),
-        "n": int(figure.items["n"].sum()),
-    }
-    row |= {"difference": _number_or_none(difference), "star": None, "word": None}
-    row |= _limit_difference(regret, difference, (labelled, against), names, asked, asked.confidence)
-    if "only" in figure.items.columns:
-        only = figure.items["only"].sum(axis=0)
-        row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
-    if figure.share and len(figure.items["n"]):
-        row["p_value"] = mcnemar_p_value(*map(int, figure.items["only"].sum(axis=0)))
-    if regret.held is not None:
-        row |= regret.held.columns()
-    if regret.kept is not None:
-        for name, kept in zip(("", "baseline_"), regret.kept, strict=True):
-            row[f"{name}existence"], row[f"{name}ghosts_kept_per_min"] = kept.existence, kept.false_positives_per_min
-    return row
-
-
-def _number_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import count_noun
-from copem_replay.core.tracks import SAME_INSTANT_S, Bool
+from copem_replay.core.tracks import Bool
 from copem_replay.metrics.config import BEGAN_BY, Slice
 from copem_replay.metrics.limits import CONFIDENCE, TRAFFIC
 from copem_replay.metrics.slices import number_groups
@@ -58,7 +58,7 @@ class EpisodeGroups:
         """A side of a pair with the cells of a group alone; by `began` each group counts its own episodes."""
         by, counted = self.named[k][0], side.counted
         if by.names(BEGAN_BY):
-            counted = side.there & (side.rows["ended_s"] - side.rows["onset_s"] > SAME_INSTANT_S)
+            counted = side.counted_however_begun
         lists = side.lists if by.of_logs else None
         return replace(side, there=side.there & kept, counted=counted & kept, lists=lists)
 

@@ -1,7 +1,8 @@
-"""Labels: names of configurations and logs across results folders, what these must have in common, and the baseline.
+"""Labels: names of configurations and logs across results folders, what these must have in common, and the baselines.
 
-Logs of one drive match by their truth, so that recordings that differ in all else are paired. Random numbers are
-addressed by the log's name: where names differ, only configurations without random draws can be paired.
+Configurations of one folder are held against one baseline, those of several folders each against itself in the first
+folder. Logs of one drive match by their truth, so that recordings that differ in all else are paired. Random numbers
+are addressed by the log's name: where names differ, only configurations without random draws can be paired.
 """
 
 from __future__ import annotations
@@ -31,20 +32,16 @@ _SHOWN = 12
 """Differences of two folders that are listed, at most: with more it is another study."""
 
 
-def log_keys(first: Results, other: Results) -> tuple[dict[str, RecordedLog], dict[str, RecordedLog]]:
-    """The logs of two folders by the digest of their truth; by that of the file where a truth is unknown or there
-    twice.
-    """
-    folders = first.provenance.logs, other.provenance.logs
-    truths = [[log.truth for log in logs] for logs in folders]
-    if all(None not in of and len(set(of)) == len(of) for of in truths):
-        return tuple({str(log.truth): log for log in logs} for logs in folders)  # type: ignore[return-value]
-    return tuple({log.sha256: log for log in logs} for logs in folders)  # type: ignore[return-value]
-
-
-def logs_match_by_truth(first: Results, other: Results) -> bool:
-    """Whether the logs of two folders match by their truth."""
-    return all(log.truth in keys for keys in log_keys(first, other) for log in keys.values())
+def log_keys(first: Results, other: Results) -> tuple[dict[tuple[str, int], RecordedLog], ...]:
+    """The logs of two folders by the digest of their truth, and a number of those that share it, by name."""
+    found: list[dict[tuple[str, int], RecordedLog]] = []
+    for folder in (first, other):
+        times = Counter[str]()
+        found.append({})
+        for log in sorted(folder.provenance.logs, key=lambda log: log.name):
+            found[-1][log.truth, times[log.truth]] = log
+            times[log.truth] += 1
+    return tuple(found)
 
 
 def rename_logs(folders: Sequence[Results]) -> tuple[list[Results], dict[Results, dict[str, str]]]:
@@ -67,12 +64,10 @@ def _replace_log_names(results: Results, to: Mapping[str, str]) -> Results:
     return renamed
 
 
-def check_log_names(
-    against: LabelledConfiguration, others: Sequence[LabelledConfiguration], names: Mapping[Results, Mapping[str, str]]
-) -> None:
+def check_log_names(pairs: Pairs, names: Mapping[Results, Mapping[str, str]]) -> None:
     """Raise InputError, a line for every log of another name, where random draws are compared."""
     problems: list[str] = []
-    for labelled in others:
+    for labelled, against in pairs.items():
         own_names, theirs = names.get(labelled.results, {}), names.get(against.results, {})
         if own_names == theirs or (_is_same_in_every_run(labelled) and _is_same_in_every_run(against)):
             continue
@@ -104,7 +99,7 @@ def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Map
 
 def _describe_differences(first: Results, other: Results, names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
     own_names, theirs = log_keys(first, other)
-    for key in own_names:
+    for key in sorted(own_names, key=lambda key: own_names[key].name):
         log, other_log = own_names[key], theirs[key]
         names_of_log = [names.get(folder, {}).get(log.name, log.name) for folder in (first, other)]
         if names_of_log[0] != names_of_log[1]:
@@ -117,7 +112,7 @@ def _describe_differences(first: Results, other: Results, names: Mapping[Results
         before, after = (folder.provenance.data.get(name) for folder in (first, other))
         if before != after and None not in (before, after):
             yield f"{name} ({_format_pair(before, after)})"
-    for part in ("pems", "units", "obstacles", "configurations"):
+    for part in ("pems", "units", "obstacles", "links", "configurations"):
         yield from _compare_keys(part, first.source.data.get(part), other.source.data.get(part))
     before, after = _rates_by_configuration(first), _rates_by_configuration(other)
     for name in before:
@@ -126,10 +121,14 @@ def _describe_differences(first: Results, other: Results, names: Mapping[Results
 
 
 def _compare_keys(where: str, before: Any, after: Any) -> Iterator[str]:
-    """Values that differ; below the first level also keys that only one has."""
+    """Values that differ; below the first level also keys that only one has. Of models of two kinds only the kinds."""
+    lists = isinstance(before, list) and isinstance(after, list) and len(before) == len(after)
+    if lists and all(isinstance(value, dict) for value in (*before, *after)):
+        before, after = dict(enumerate(before)), dict(enumerate(after))
     if isinstance(before, dict) and isinstance(after, dict):
         alone = "." in where  # a unit or configuration that only one has is no difference of those that both have
-        for key in dict.fromkeys([*before, *after]):
+        kinds = before.get("kind") != after.get("kind")
+        for key in ["kind"] if kinds else dict.fromkeys([*before, *after]):
             if alone or (key in before and key in after):
                 yield from _compare_keys(f"{where}.{key}", before.get(key), after.get(key))
     elif before != after:
@@ -151,17 +150,8 @@ def _rates_by_configuration(results: Results) -> dict[str, float]:
 # What folders must have in common to be compared.
 
 _MEASURE = (
-    "objects",
-    "onset",
-    "began",
-    "count_earlier",
-    "confirm",
-    "match",
-    "distance_to",
-    "gospa",
-    "annotated",
-    "weigh",
-)
+    "objects", "onset", "began", "count_earlier", "confirm", "match", "distance_to", "gospa", "annotated", "weigh",
+)  # fmt: skip
 """Keys of `measure` that the compared metrics depend on."""
 
 
@@ -180,7 +170,7 @@ def _find_problems(first: Results, other: Results) -> Iterator[str]:
     for key in ("seed", "window_s", "max_gap_s"):
         yield from _describe_mismatch(first, other, key, getattr(before, key), getattr(after, key))
     # As written, for the ego that `null` stands for is in the logs.
-    if other_logs or not logs_match_by_truth(first, other):  # equal truths have the same ego
+    if other_logs:  # equal truths have the same ego
         yield from _describe_mismatch(first, other, "ego", first.source.data.get("ego"), other.source.data.get("ego"))
     for key in _MEASURE:
         yield from _describe_mismatch(first, other, f"measure.{key}", before.measure.get(key), after.measure.get(key))
@@ -196,39 +186,19 @@ def _find_problems(first: Results, other: Results) -> Iterator[str]:
 def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
     if expected != found:
         yield (
-            f"{other.place}: {key}: expected {_shorten_value(expected)} as in {first.place}, found "
-            f"{_shorten_value(found)}"
+            f"{other.place}: {key}: expected {json.dumps(expected, ensure_ascii=False)} as in {first.place}, found "
+            f"{json.dumps(found, ensure_ascii=False)}"
         )
-
-
-def _shorten_value(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _compare_logs(first: Results, other: Results) -> Iterator[str]:
-    """Problems of the logs: other drives; where logs match by file only, other names or topics too."""
-    by_truth = logs_match_by_truth(first, other)
-    expected, found = ({key: log.name for key, log in keys.items()} for keys in log_keys(first, other))
-    missing, more = ([a[sha] for sha in a if sha not in b] for a, b in ((expected, found), (found, expected)))
-    if missing or more:
-        lacks = [f"{', '.join(missing)} missing"] if missing else []
-        other_ones = (
-            [f"{', '.join(more)} of {'another truth' if by_truth else 'other content (SHA-256)'}"] if more else []
-        )
-        yield f"{other.place}: expected the logs of {first.place}, found {' and '.join(lacks + other_ones)}"
-        return
-    if by_truth:
-        return
-    names, other_names = (sorted(log.name for log in folder.provenance.logs) for folder in (first, other))
-    if names != other_names or expected != found:
-        yield (
-            f"{other.place}: expected the logs to be named as in {first.place}, {', '.join(names)}, found "
-            f"{', '.join(other_names)}: draws are by the log's name"
-        )
-        return
-    topics, other_topics = ({log.name: log.topic for log in folder.provenance.logs} for folder in (first, other))
-    for name, topic in topics.items():
-        yield from _describe_mismatch(first, other, f"log {name}: topic", topic, other_topics[name])
+    """A problem where the logs are of other drives."""
+    expected, found = log_keys(first, other)
+    missing = sorted(expected[key].name for key in expected if key not in found)
+    more = sorted(found[key].name for key in found if key not in expected)
+    says = [f"{', '.join(missing)} missing"] * bool(missing) + [f"{', '.join(more)} of another truth"] * bool(more)
+    if says:
+        yield f"{other.place}: expected the logs of {first.place}, found {' and '.join(says)}"
 
 
 def notes_on_folders(folders: Sequence[Results]) -> Iterator[str]:
@@ -261,11 +231,8 @@ IDEAL_NAME = "ideal"
 
 
 class Baseline(NamedTuple):
-    """The baseline of an experiment where none is asked for. `why`: in words; `rank`: 0 by name, 1 the ideal of the
-    same inputs, 2 the first.
-    """
+    """The baseline of an experiment where none is asked for. `why`: in words."""
 
-    rank: int
     name: str
     why: str
 
@@ -277,12 +244,12 @@ def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str])
     else the first that is not the truth.
     """
     if IDEAL_NAME in names:
-        return Baseline(0, IDEAL_NAME, "by its name")
+        return Baseline(IDEAL_NAME, "by its name")
     for name in names:
         if (ideal := facts[name].ideal) in names:
-            return Baseline(1, str(ideal), f"ideal fusion of the {facts[name].ideal_of} of {name}")
+            return Baseline(str(ideal), f"ideal fusion of the {facts[name].ideal_of} of {name}")
     fused = [name for name in names if not facts[name].truth]
-    return Baseline(2, fused[0], "the first that is not the truth") if fused else Baseline(2, names[0], "the first")
+    return Baseline(fused[0], "the first that is not the truth") if fused else Baseline(names[0], "the first")
 
 
 def find_alone(results: Results, names: Sequence[str]) -> str | None:
@@ -301,31 +268,32 @@ def find_alone(results: Results, names: Sequence[str]) -> str | None:
     return min(own, key=lambda name: mean_s[name], default=None)
 
 
-def notes_on_output_baseline(baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]) -> Iterator[str]:
+def notes_on_output_baseline(pairs: Pairs) -> Iterator[str]:
     """Notes on recorded outputs whose difference to the baseline is no regret."""
-    for labelled in (labelled for labelled in others if labelled.facts.recorded):
+    for labelled, baseline in pairs.items():
         ideal = labelled.facts.ideal
+        if not labelled.facts.recorded or labelled.configuration == baseline.configuration:
+            continue
         if labelled.facts.ideal_of != "inputs":
             yield f"{labelled.label}: no regret, for it has no `inputs`: only a difference to {baseline.label}"
         elif baseline.configuration != ideal:
             yield f"{labelled.label}: its regret is to {ideal}, ideal fusion of its inputs (--baseline {ideal})"
 
 
-def find_remembering(
-    known: Sequence[LabelledConfiguration], baseline: LabelledConfiguration, others: Sequence[LabelledConfiguration]
-) -> dict[LabelledConfiguration, LabelledConfiguration]:
+def find_remembering(known: Sequence[LabelledConfiguration], pairs: Pairs) -> Pairs:
     """The ideal fusions with memory that accuracy is held against, of configurations that remember.
 
     Those whose baseline is their own ideal.
     """
-    named = {(labelled.results, labelled.configuration): labelled for labelled in known}
-    pairs = ((labelled, named.get((labelled.results, str(labelled.facts.remembering)))) for labelled in others)
-    own = ((labelled.results, labelled.facts.ideal) for labelled in others)
-    is_own = [one == (baseline.results, baseline.configuration) for one in own]
-    return {one: other for (one, other), mine in zip(pairs, is_own, strict=True) if mine and other is not None}
+    named = {(one.results, one.configuration): one for one in known}
+    own = [
+        one for one, other in pairs.items() if (one.results, one.facts.ideal) == (other.results, other.configuration)
+    ]
+    found = {one: named.get((one.results, str(one.facts.remembering))) for one in own}
+    return {one: other for one, other in found.items() if other is not None}
 
 
-def notes_on_remembering(pairs: Mapping[LabelledConfiguration, LabelledConfiguration]) -> Iterator[str]:
+def notes_on_remembering(pairs: Pairs) -> Iterator[str]:
     """A note on each ideal fusion with memory that accuracy is held against."""
     for ideal in dict.fromkeys(pairs.values()):
         names = ", ".join(labelled.label for labelled, other in pairs.items() if other == ideal)
@@ -348,9 +316,9 @@ class LabelledConfiguration:
         """What the configuration is."""
         return self.results.facts[self.configuration]
 
-    def is_meant_by(self, name: str) -> bool:
-        """Whether a name stands for it, and perhaps for others."""
-        return name in (self.label, self.configuration, f"{self.results.name}:{self.configuration}")
+
+Pairs = Mapping[LabelledConfiguration, LabelledConfiguration]
+"""What each configuration is held against."""
 
 
 def label_configurations(folders: Sequence[Results]) -> list[LabelledConfiguration]:
@@ -369,62 +337,86 @@ def label_configurations(folders: Sequence[Results]) -> list[LabelledConfigurati
     return labelled
 
 
+def name_folders(folders: Sequence[Results]) -> list[str]:
+    """The names of folders, by which labels tell them apart: paths where names are the same."""
+    times = Counter(folder.name for folder in folders)
+    return [folder.name if times[folder.name] == 1 else str(folder.place) for folder in folders]
+
+
 def _configuration_names(results: Results) -> list[str]:
     """Names of the configurations that have rows, in their order."""
     return list(results.by_log["detections.parquet"].configurations)
 
 
-def choose_configurations(
-    known: Sequence[LabelledConfiguration], configurations: Sequence[str] | None, baseline: str | None
-) -> tuple[LabelledConfiguration, ...]:
-    """The baseline, then the configurations to compare with it, each once. Raises InputError.
+def pair_configurations(
+    folders: Sequence[Results], configurations: Sequence[str] | None, baseline: str | None
+) -> dict[LabelledConfiguration, LabelledConfiguration]:
+    """The configurations to compare, each once, with what each is held against. Raises InputError.
 
-    `baseline`: None: that of `choose_baseline`. A name that several folders have stands for all of them; as a baseline
-    it has to be one.
+    `configurations`: names, of which one that several folders have stands for all of them; None: all. `baseline`: a
+    name that is one configuration; None: of one folder that of `find_baseline`, of several each against itself in the
+    first folder.
     """
-    labels = [labelled.label for labelled in known]
-    against = choose_baseline(known)[0] if baseline is None else _find_named_baseline(known, labels, baseline)
+    known = label_configurations(folders)
     wanted: list[LabelledConfiguration] = list(known) if configurations is None else []
     problems = []
     for name in configurations or ():
         meant = _find_meant(known, name)
         wanted += meant
         if not meant:
-            problems.append(f"--configurations: {unknown_name_message('configuration', name, labels)}")
+            hint = unknown_name_message("configuration", name, dict.fromkeys(one.configuration for one in known))
+            problems.append(f"--configurations: {hint}")
     if problems:
         raise InputError(problems)
+    if baseline is None and len(folders) > 1:
+        return _pair_with_first(folders, known, wanted)
+    if baseline is None:
+        baseline = find_baseline(folders[0].facts, [labelled.configuration for labelled in known]).name
+    against = _find_named_baseline(known, baseline)
     others = [labelled for labelled in dict.fromkeys(wanted) if labelled is not against]
     if not others:
         raise InputError(f"compare: expected a configuration beside the baseline {against.label}, found none")
-    return against, *others
+    return dict.fromkeys(others, against)
 
 
-def choose_baseline(known: Sequence[LabelledConfiguration]) -> tuple[LabelledConfiguration, str]:
-    """The baseline where none is asked for, and why: by the first clause of `find_baseline` that holds in a folder.
+def _pair_with_first(
+    folders: Sequence[Results], known: Sequence[LabelledConfiguration], wanted: Sequence[LabelledConfiguration]
+) -> dict[LabelledConfiguration, LabelledConfiguration]:
+    """Configurations of later folders, each with itself in the first one. Raises InputError where there is none."""
+    old = {labelled.configuration: labelled for labelled in known if labelled.results is folders[0]}
+    later = [labelled for labelled in dict.fromkeys(wanted) if labelled.results is not folders[0]]
+    pairs = {labelled: old[labelled.configuration] for labelled in later if labelled.configuration in old}
+    if not pairs:
+        found = ", ".join(dict.fromkeys(labelled.configuration for labelled in later)) or "none"
+        raise InputError(
+            f"compare: expected a configuration of {folders[0].place} ({', '.join(old)}) in a later folder, found "
+            f"{found}; --baseline NAME holds all against one"
+        )
+    return pairs
 
-    Where it holds in several folders, that of the first one.
-    """
-    folders: dict[Results, dict[str, LabelledConfiguration]] = {}
-    for labelled in known:
-        folders.setdefault(labelled.results, {})[labelled.configuration] = labelled
-    found = [(find_baseline(folder.facts, list(those)), those) for folder, those in folders.items()]
-    baseline, those = min(found, key=lambda pair: pair[0].rank)
-    return those[baseline.name], baseline.why
+
+def notes_on_missing(folders: Sequence[Results]) -> Iterator[str]:
+    """Notes on configurations that only the first folder has, or only a later one."""
+    for other in folders[1:]:
+        names = [_configuration_names(results) for results in (folders[0], other)]
+        for results, own, theirs in zip((folders[0], other), names, names[::-1], strict=True):
+            if alone := [name for name in own if name not in theirs]:
+                yield f"only in {results.place}, so not compared: {', '.join(alone)}"
 
 
 def _find_meant(known: Sequence[LabelledConfiguration], name: str) -> list[LabelledConfiguration]:
-    return [labelled for labelled in known if labelled.label == name] or [
-        labelled for labelled in known if labelled.is_meant_by(name)
+    """The configuration of this label, else all that have the name, by itself or after their folder's."""
+    return [one for one in known if one.label == name] or [
+        one for one in known if name in (one.configuration, f"{one.results.name}:{one.configuration}")
     ]
 
 
-def _find_named_baseline(
-    known: Sequence[LabelledConfiguration], labels: Sequence[str], name: str
-) -> LabelledConfiguration:
+def _find_named_baseline(known: Sequence[LabelledConfiguration], name: str) -> LabelledConfiguration:
     meant = _find_meant(known, name)
     if len(meant) == 1:
         return meant[0]
     if meant:
         several = ", ".join(labelled.label for labelled in meant)
         raise InputError(f"--baseline: expected one of {several}, found {meant[0].configuration}, which may be any")
-    raise InputError(f"--baseline: {unknown_name_message('configuration', name, labels)}")
+    hint = unknown_name_message("configuration", name, [labelled.label for labelled in known])
+    raise InputError(f"--baseline: {hint}")

@@ -143,13 +143,8 @@ def _add_log(
     if before is None or not len(before.existence):
         return GhostTotals(minutes, thresholds, ghosts, least, most)
     ghosts = ghosts if len(lengths) else np.zeros_like(before.at)
-    return GhostTotals(
-        before.minutes + minutes,
-        before.existence,
-        before.at + ghosts,
-        min(before.least, least),
-        max(before.most, most),
-    )
+    extremes = min(before.least, least), max(before.most, most)
+    return GhostTotals(before.minutes + minutes, before.existence, before.at + ghosts, *extremes)
 
 
 def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint | None:
@@ -266,13 +261,9 @@ class Regret:
     def joined(of_logs: Sequence[Regret]) -> Regret:
         """The same metric over several logs."""
         figures, held = [regret.figure for regret in of_logs], [r.held for r in of_logs if r.held is not None]
-        return Regret(
-            of_logs[0].metric,
-            type(figures[0]).joined(figures),
-            tuple(counts for regret in of_logs for counts in regret.counts),
-            of_logs[0].kept,
-            reduce(HeldCounts.__add__, held) if held else None,
-        )
+        counts = tuple(counts for regret in of_logs for counts in regret.counts)
+        all_held = reduce(HeldCounts.__add__, held) if held else None
+        return Regret(of_logs[0].metric, type(figures[0]).joined(figures), counts, of_logs[0].kept, all_held)
 
 
 def total_counts(counts: Iterable[tuple[int, int]]) -> tuple[int, int, int]:
@@ -323,8 +314,8 @@ class _Pair:
 
 
 def compute_regrets(
-    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, only: Sequence[str] | None = None,
-) -> Iterator[Regret]:  # fmt: skip
+    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, only: Sequence[str] | None = None
+) -> Iterator[Regret]:
     """The metrics of a log, all or `only` some, for which both sides have the data.
 
     Those of lists are over all rows that both sides have, the others over those that count.

@@ -155,6 +155,20 @@ class PairSide:
     lists: Columns | None
     steps: Columns | None
 
+    @property
+    def counted_however_begun(self) -> Bool:
+        """There, and counted if all did, however they began."""
+        return self.there & (self.rows["ended_s"] - self.rows["onset_s"] > SAME_INSTANT_S)
+
+    def has_rows_of(self, other: PairSide) -> bool:
+        """Whether all rows, and all lists by their counts, say the same on another side, as far as both are written."""
+        if not np.array_equal(self.there, other.there):
+            return False
+        pairs = [(of[self.there], other.rows[name][self.there]) for name, of in self.rows.items() if name in other.rows]
+        if self.lists is not None and other.lists is not None:
+            pairs += [(of, other.lists[name]) for name, of in self.lists.items() if name in other.lists]
+        return all(np.array_equal(one, of, equal_nan=True) for one, of in pairs)
+
 
 def configuration_rows(labelled: LabelledConfiguration, tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
     """The rows of a configuration, by table."""
@@ -224,18 +238,11 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
     if (first[kept] < 0).any() or ((first + length)[kept] > len(frame_s))[length[kept] > 0].any():
         raise InputError(f"{place}: expected frames of instants.parquet, found more; {AGAIN}")
     return AccuracyData(
-        start=_lay_out(np.cumsum(length) - length, cell, size),
-        length=_lay_out(length, cell, size),
-        first=_lay_out(first, cell, size),
-        ghosts=_lay_out(integer_column(rows["ghosts"]), cell, size),
-        error_m=columns["error_held_m"][1],
-        age_s=columns["age_held_s"][1],
-        gospa=columns["gospa_held_m2"][1],
-        frame_s=frame_s,
-        begins=begins,
-        holds=holds,
-        of_run=of_run,
-    )
+        start=_lay_out(np.cumsum(length) - length, cell, size), length=_lay_out(length, cell, size),
+        first=_lay_out(first, cell, size), ghosts=_lay_out(integer_column(rows["ghosts"]), cell, size),
+        error_m=columns["error_held_m"][1], age_s=columns["age_held_s"][1], gospa=columns["gospa_held_m2"][1],
+        frame_s=frame_s, begins=begins, holds=holds, of_run=of_run,
+    )  # fmt: skip
 
 
 def _read_frames(place: Path, rows: pa.Table, grid: PairingGrid) -> tuple[Float, Int, Bool, Int]:

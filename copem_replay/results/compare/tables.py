@@ -45,11 +45,13 @@ def comparison_text(comparison: Comparison, width: int | None = None) -> str:
 
     `width`: None for a pipe.
     """
+    comparison = comparison.changed
     lines = (part for line in comparison_lines(comparison) for part in wrap_line(line, width))
     held = held_cells(comparison)
     tables = [format_table(held, width)] if len(held) else []
     groups = [f"\n{table}" for table in _group_blocks(comparison, width)]
-    return "\n".join([format_table(_format_cells(comparison), width), *lines, *tables, *groups])
+    whole = [format_table(_format_cells(comparison), width)] if comparison.configurations else []
+    return "\n".join([*whole, *lines, *tables, *groups])
 
 
 def _group_blocks(comparison: Comparison, width: int | None) -> Iterator[str]:
@@ -74,6 +76,7 @@ def _format_groups(by: str, rows: pd.DataFrame) -> pd.DataFrame:
 
 def comparison_markdown(comparison: Comparison) -> str:
     """The comparison as Markdown: its table, lines and notes as a list, what errors are over; ends with a newline."""
+    comparison = comparison.changed
     held, notes = held_cells(comparison), (f"note: {note}" for note in comparison.notes)
     lines = [f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)]
     beside = ["", *_markdown_rows(held)] if len(held) else []
@@ -81,7 +84,8 @@ def comparison_markdown(comparison: Comparison) -> str:
         for by, rows in comparison.groups.groupby("by", sort=False):
             chance = (f"- {escape_markdown(line)}" for line in describe_group_chance(rows))
             beside += ["", *_markdown_rows(_format_groups(str(by), rows)), "", *chance]
-    return "\n".join([*_markdown_rows(_format_cells(comparison)), "", *lines, *beside, ""])
+    cells = [*_markdown_rows(_format_cells(comparison)), ""] if comparison.configurations else []
+    return "\n".join([*cells, *lines, *beside, ""])
 
 
 def _markdown_rows(cells: pd.DataFrame) -> Iterator[str]:
@@ -163,6 +167,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     shown = set(overall["metric"])
     of_lists = "accuracy of what is held at each frame"
     yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
+    if comparison.unchanged:
+        yield f"unchanged: {', '.join(comparison.unchanged)}"
     if comparison.baseline_why is not None:
         yield f"baseline {comparison.baseline}: {comparison.baseline_why}; --baseline names another"
     limited = overall.dropna(subset="interval_over")
@@ -175,10 +181,11 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     yield from _describe_intervals(overall)
     yield f"ttd_rmst_s: {describe_mean(comparison.horizon_s, censored=True)}"
     if "ttd_rmst_s_equal_ghosts" in shown:
+        rate = comparison.false_positives_per_min
+        ghosts = f"as many ghosts as in {comparison.baseline}" if rate is None else f"{rate:.4g} ghosts per minute"
         yield (
             "ttd_rmst_s_equal_ghosts: the same mean by match (also for ideal fusion and the truth), with the least "
-            f"certain entries of each left out until {comparison.false_positives_per_min:.4g} ghosts per minute "
-            "remain, not counting stale ones"
+            f"certain entries of each left out until {ghosts} remain, not counting stale ones"
         )
     yield from _describe_held(comparison)
     yield from _describe_better(comparison)
