@@ -63,6 +63,7 @@ def test_the_job_runs_as_it_stands(
     typed(job[2].replace("out/new", "out/before"), capsys)
     code, out = typed(against[0], capsys)
     assert code == 0, out
+    assert out.splitlines()[-1] == "new against before: nothing changed: PEM, coPEM:0s, coPEM:0.5s and 2 more"
     assert typed(past[0], capsys)[0] == 0
     assert "the ego brakes in time" in Path("out/history.html").read_text()
 
@@ -106,6 +107,11 @@ def test_the_action_runs_and_judges_and_writes_the_summary(here: Path, tmp_path:
     assert "3 of 3 verdicts pass" in summary.read_text()
     assert (here / "out/new/verdicts.xml").is_file()
     assert (here / "out/new/report.html").is_file()
+    before = variables | {"BEFORE": "out/before", "CRITERIA": ""}
+    shutil.copytree(here / "out/new", here / "out/before", dirs_exist_ok=True)
+    done = subprocess.run(["bash", "-e", "-c", step["run"]], cwd=here, env=os.environ | before | path, check=False,
+                          capture_output=True, text=True)  # fmt: skip
+    assert summary.read_text().splitlines()[-2].startswith("new against before: nothing changed: "), done.stderr
     broken = variables | {"CRITERIA": "nowhere.yaml"}
     done = subprocess.run(["bash", "-e", "-c", step["run"]], cwd=here, env=os.environ | broken | path, check=False,
                           capture_output=True, text=True)  # fmt: skip
