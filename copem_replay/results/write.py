@@ -123,7 +123,8 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         truths = {name for name, of in run.every.items() if of.units == TRUTH}
         notes = write_mcap(
             path, here, run.replayed.replay.scene, run.replayed.run_tracks, table, run.manifest,
-            find_family(recording), recording.window, truth, configuration_colours(run.every, truths),
+            find_family(recording), recording.window, truth,
+            colours=configuration_colours(run.every, truths),
         )  # fmt: skip
         check_files_unchanged(stamps)
     return notes

@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from copem_replay.communication.link import LinkModel
-from copem_replay.core.colours import REST, Rgb, configuration_colours
+from copem_replay.core.colours import TRUTH, Rgb, configuration_colours
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.files import remove_leftovers
 from copem_replay.experiment.drive import resolve_for_log
@@ -190,7 +190,7 @@ def _colour_versions(chosen: Sequence[LabelledConfiguration], older: Sequence[La
     for one in chosen:
         truths = [name for name, facts in one.results.facts.items() if facts.truth]
         own = configuration_colours(one.results.experiment.configurations, truths)
-        red, green, blue = ((a + b) // 2 for a, b in zip(own[one.configuration], REST, strict=True))
+        red, green, blue = ((a + b) // 2 for a, b in zip(own[one.configuration], TRUTH, strict=True))
         colours[one.label] = (red, green, blue) if one in older else own[one.configuration]
     return colours
 

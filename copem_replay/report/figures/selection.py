@@ -15,7 +15,7 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.onset import COUNTS_BY
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
+from copem_replay.report.figures.style import shorten_names, sort_soonest_first
 from copem_replay.results.compare.labels import find_baseline
 from copem_replay.results.shown_objects import choose_shown_objects, measure_apart
 

@@ -67,23 +67,18 @@ def link_story(log: str, object_id: str, words: str | None = None) -> Html:
     return make_tag("a", "story", class_="to", href=href) if words is None else make_tag("a", words, href=href)
 
 
-_STORY_LINK = re.compile(r'<a( class="to")? href="#(story-[^"]*)">(.*?)</a>')
-
-
-def drop_dead_links(body: Html) -> Html:
-    """A body without links to stories that it does not have; their words stay."""
-    return Html(_STORY_LINK.sub(lambda to: to[0] if f' id="{to[2]}"' in body else "" if to[1] else to[3], body))
-
-
 def link_player(log: str, object_id: str) -> Html:
     """A link to an object in the player, whose script takes out those to objects that it does not play."""
     return make_tag("a", "player", class_="to", href="#player", data_log=log, data_played=object_id)
 
 
-def drop_dead_links(html: str) -> Html:
-    """A page without the links of this kind that lead nowhere."""
-    ids = set(re.findall(r' id="([^"]+)"', html))
-    return Html(re.sub(r'<a class="to" href="#([^"]+)".*?</a>', lambda link: link[0] if link[1] in ids else "", html))
+_LINK = re.compile(r'<a( class="to")? href="#([^"]+)"[^>]*>(.*?)</a>')
+
+
+def drop_dead_links(body: Html) -> Html:
+    """A body without links that lead nowhere within it: words of a sentence stay, links of their own go."""
+    ids = set(re.findall(r' id="([^"]+)"', body))
+    return Html(_LINK.sub(lambda to: to[0] if to[2] in ids else "" if to[1] else to[3], body))
 
 
 def fold_parts(title: str, *parts: str) -> Html:

@@ -190,7 +190,7 @@ def build_page(study: ReportData) -> str:
         *([_configuration_key(study)] if measured and len(study.names) > 1 else []),
     )
     parts = (make_tag("section", make_tag("h2", s.title), *s.parts, id_=s.id) for s in sections)
-    return whole_page(title, drop_dead_links(join_html([head, *parts])))
+    return whole_page(title, join_html([head, *parts]))
 
 
 def _false_sections(study: ReportData) -> Iterator[_Section]:

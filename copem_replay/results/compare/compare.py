@@ -563,7 +563,10 @@ class PairRows:
         self, labelled: LabelledConfiguration, regret: Regret, difference: float, confidence: float
     ) -> dict[str, object]:
         """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
-        over, sides = "runs" if self.asked.over_runs else regret.over, (labelled, self._baseline_of(labelled, regret.metric))
+        over, sides = (
+            "runs" if self.asked.over_runs else regret.over,
+            (labelled, self._baseline_of(labelled, regret.metric)),
+        )
         what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
         fixed = all(getattr(side.facts, what) for side in sides)
         limits = difference_limits(regret.figure, difference, over, self.names, fixed=fixed, confidence=confidence)
