@@ -155,7 +155,7 @@ def print_notes(lines: Iterable[str]) -> None:
     print_problems(f"note: {line}" for line in lines)
 
 
-MOST_NOTES = 8
+MOST_NOTES = 4
 """More lines are not read: the rest is in `info` and in the results."""
 
 
@@ -163,7 +163,8 @@ def print_first_notes(lines: Sequence[str]) -> None:
     """Print the first notes on stderr, and where the others are."""
     print_notes(lines[:MOST_NOTES])
     if len(lines) > MOST_NOTES:
-        print_notes(["further notes: `copem-replay info LOG`, and read.csv of the results"])
+        more = len(lines) - MOST_NOTES
+        print_problems([f"and {count_noun(more, 'more note')}: `copem-replay info LOG`, and read.csv of the results"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

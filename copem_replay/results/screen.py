@@ -182,7 +182,8 @@ SHOWN = {
 
 
 def choose_notes(notes: Sequence[str]) -> list[str]:
-    """Notes without those that are about other figures than those of the screen."""
+    """Notes without those that are about other figures than those of the screen, in fewer words."""
+    notes = [re.sub("^no interval of [^:]*: ([^;]*);.*", r"no interval: \1", note) for note in notes]
     named = [{*re.findall(r"\w+", note)} & {*COMPARED} for note in notes]
     return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*SHOWN}]
 
