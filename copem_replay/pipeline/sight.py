@@ -91,8 +91,8 @@ def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, ke
     """The spans of a status (K,) until `end_ns`, none shorter than `STEADY_S`; 0: the object is absent.
 
     A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
-    too short as a whole continues the span before, unless the object is absent then. The first span of the
-    status `kept` stays, however short.
+    too short as a whole continues the span before, unless the object is absent then. The first span of the status
+    `kept` stays, however short.
     """
     steady_ns = round(STEADY_S * 1e9)
     first = np.flatnonzero(np.diff(status, prepend=-1))
@@ -131,7 +131,7 @@ class SightSpan:
 def list_sight_spans(
     replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
 ) -> list[SightSpan]:
-    """What the units `names` have of object m between two instants, in order; nothing where none is modelled."""
+    """What the units `names` have of object m, while it is there between two instants; nothing of recorded units."""
     every = list(replay.expanded.units)
     units = [every.index(name) for name in names if name in replay.expanded.modelled]
     time_s = sight.elapsed_ns * 1e-9
@@ -151,7 +151,7 @@ def list_sight_spans(
             by, body_ix = sight.find_hider(unit_ix[of_span], frames[of_span], m)
             what = {"unit": every[by], "body": bodies[body_ix], "body_ix": body_ix}
         spans.append(SightSpan(of, float(begins_ns[span.first]) * 1e-9, end_s, **what))
-    return spans
+    return [span for span in spans if span.state != ABSENT]
 
 
 def name_bodies(scene: Scene, solids: Sequence[str], ids: Sequence[str]) -> list[str]:
@@ -165,7 +165,7 @@ def compute_sight(
 ) -> Sight:
     """The sight of the shown objects, at the frames of the truth that have any of them.
 
-    `found`: observations whose visible shares are taken instead of being computed again.
+    `observed`: observations whose visible shares are taken instead of being computed again.
     """
     scene, truth = replay.scene, replay.truth
     stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
