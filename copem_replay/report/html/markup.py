@@ -72,13 +72,13 @@ def link_player(log: str, object_id: str) -> Html:
     return make_tag("a", "player", class_="to", href="#player", data_log=log, data_played=object_id)
 
 
-_LINK = re.compile(r'<a( class="to")? href="#([^"]+)"[^>]*>(.*?)</a>')
+_LINK = re.compile(r'( ?)<a( class="to")? href="#([^"]+)"[^>]*>(.*?)</a>')
 
 
 def drop_dead_links(body: Html) -> Html:
     """A body without links that lead nowhere within it: words of a sentence stay, links of their own go."""
     ids = set(re.findall(r' id="([^"]+)"', body))
-    return Html(_LINK.sub(lambda to: to[0] if to[2] in ids else "" if to[1] else to[3], body))
+    return Html(_LINK.sub(lambda to: to[0] if to[3] in ids else "" if to[2] else to[1] + to[4], body))
 
 
 def fold_parts(title: str, *parts: str) -> Html:
