@@ -21,6 +21,8 @@ from copem_replay.extras.film.film import choose_instants
 from tests.helpers.experiments import changed, drive
 
 NAMES = ["GT", "late", "never"]
+COLOURS = configuration_colours(NAMES, NAMES, "light")
+"""On white; all are of the truth, so that none is grey."""
 CONFIGURATIONS = """\
 configurations:
   GT: {units: truth}
@@ -85,7 +87,7 @@ def test_bars_begin_at_the_detection_of_the_table(results: Path, film: Path) -> 
     assert begins_s.notna().to_dict() == {"GT": True, "late": True, "never": False}
     picture = frames(film)[-1]
     bars = picture[-105:]
-    for name, colour in list(configuration_colours(NAMES, ["GT"], "light").items())[1:]:  # letters are grey, too
+    for name, colour in COLOURS.items():
         columns = np.flatnonzero(coloured(bars, colour).sum(axis=0) >= 5)
         if name == "never":
             assert not len(columns)
@@ -97,8 +99,7 @@ def test_bars_begin_at_the_detection_of_the_table(results: Path, film: Path) -> 
 
 def test_nothing_is_known_in_a_picture_before(film: Path) -> None:
     before = frames(film)[9]  # a tenth of a second before the onset
-    _, *colours = configuration_colours(NAMES, ["GT"], "light").values()
-    assert not any(coloured(before[-105:], colour).sum(axis=0).max() >= 5 for colour in colours)
+    assert not any(coloured(before[-105:], colour).sum(axis=0).max() >= 5 for colour in COLOURS.values())
 
 
 def test_a_configuration_without_a_list_draws_no_boxes(film: Path) -> None:
