@@ -48,7 +48,7 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
         if np.isfinite(last_s)
         else f"{best_s:.2f} s after the onset instead of never"
     )
-    return f"What would help {last}: {change}, as in {best}: known {gain}, with the same draws."
+    return f"What would help {last}: {change} ({best}): known {gain}."
 
 
 def _find_changed_keys(experiment: Experiment, last: str, other: str) -> list[str]:
@@ -61,7 +61,7 @@ def _value_of(experiment: Experiment, key: str, name: str) -> Any:
 
 
 def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, best: str) -> str:
-    """What is better in the other one: “0 s of latency instead of 1.5 s”; “” where much is different."""
+    """What is better in the other one: “without the 1.5 s of latency”; “” where much is different."""
     values = {key: (_value_of(experiment, key, last), _value_of(experiment, key, best)) for key in keys}
     old_units, new_units = values.pop("units", (frozenset(), frozenset()))
     rest = f" (and another {' and '.join(_KEYS[key] for key in values)})" if values else ""
@@ -73,7 +73,7 @@ def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, bes
         return f"the lists of {_name_units(new_units)} instead"
     [(key, (old, new))] = values.items()
     if key == "latency_s" and not isinstance(old, dict) and not isinstance(new, dict):
-        return f"{new:g} s of latency instead of {old:g} s"
+        return f"{new:g} s of latency instead of {old:g} s" if new else f"without the {old:g} s of latency"
     if key == "fusion" and old.kind != new.kind:
         return f"fusion {new.kind} instead of {old.kind}"
     return "no link" if key == "link" and new is None else f"another {_KEYS[key]}"

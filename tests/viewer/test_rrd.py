@@ -476,8 +476,7 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
         "| pole | 0.00 s | 80.0 m | **too near**, 0.2 m | pole |",
         "| none | never | – | **hits** at 10.0 m/s | – |",
         "",
-        "What would help none: the lists of pole instead, as in pole: known 0.00 s after the onset instead of never, "
-        "with the same draws.",
+        "What would help none: the lists of pole instead (pole): known 0.00 s after the onset instead of never.",
     ]
     both = (static(path, entity)["TextDocument:text"] for entity in ("/difference_short", "/difference"))
     assert next(both) == next(both), "one object is all of it"

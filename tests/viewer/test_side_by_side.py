@@ -254,9 +254,7 @@ def test_what_would_help_is_said_of_one_experiment_alone(call: Compare, tmp_path
         asked = ("--configurations", names, "--baseline", "now" if len(folders) == 1 else "g:now", "--rrd", "x.rrd")
         assert call("compare", *folders, *asked)[0] == 0
         told[len(folders)] = static(tmp_path / "x.rrd", "/difference")["TextDocument:text"][0]
-    words = (
-        "What would help late: 0 s of latency instead of 0.5 s, as in now: known 0.50 s earlier, with the same draws."
-    )
+    words = "What would help late: without the 0.5 s of latency (now): known 0.50 s earlier."
     assert words in told[1]
     assert "What would help" not in told[2]
 
