@@ -70,7 +70,7 @@ def compare(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON: the answer, notes and every row.")] = False,
 ) -> int:
-    """Compare configurations with a baseline, or results with older ones.
+    """Compare configurations with a baseline, or new results with old.
 
     They are paired by log, object and run. OLD NEW: each configuration of the newer results folder minus itself in the
     older one, and in one line whether it is better or worse.
@@ -199,7 +199,8 @@ def _check_rrd_options(rrd: Path | None, run: int | None, log: str | None) -> No
 def _print_written(*files: Path | None) -> None:
     for file in files:
         if file is not None:
-            print_line(f"written to {file}")
+            opens = f"; next: copem-replay view {file}" if file.suffix == ".rrd" else ""
+            print_line(f"written to {file}{opens}")
 
 
 def verdict(
@@ -301,7 +302,7 @@ def view(
 ) -> int:
     """Open the recordings of a results folder in the viewer.
 
-    Each opens half a second before the first onset, or that of an object.
+    Each opens half a second before the first onset of the objects that tell most, or that of an object.
     """
     from copem_replay.api.results import view as view_results
 

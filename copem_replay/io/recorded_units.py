@@ -82,7 +82,7 @@ def describe_oddities(lists: RecordedLists, object_ix: Int, scene: Scene) -> Ite
     if count and unknown > MANY * count:
         yield (
             f"{unknown} of {count_noun(count, 'entry', 'entries')} match nothing in the truth (not labelled, or false);"
-            " all count as false positives"
+            " those of a measured class count as false positives"
         )
 
 

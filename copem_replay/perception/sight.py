@@ -142,14 +142,15 @@ class SightTimes(NamedTuple):
 
 
 def measure_sight(
-    spans: SightSpans, experiment: PerceptionSetup, names: Sequence[str], equipped: Bool, until_s: Float
+    spans: SightSpans, experiment: PerceptionSetup, names: Sequence[str] | None, equipped: Bool, until_s: Float
 ) -> SightTimes:
-    """The times of the units `names`; `equipped (S | 1, U)`: which of the experiment's units each run has.
+    """The times of the units `names`, None of the truth.
 
+    `equipped (S | 1, U)`: which of the experiment's units each run has.
     `until_s (S | 1, M)`: when each object is first listed, or its episode ends.
     """
     episodes = until_s.shape[1]
-    if not names or any(name not in experiment.modelled for name in names):
+    if names is None or any(name not in experiment.modelled for name in names):
         return SightTimes(*np.full((3, 1, episodes), np.nan))
     modelled, every = list(experiment.modelled), list(experiment.units)
     patterns, which = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)

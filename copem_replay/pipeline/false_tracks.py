@@ -8,8 +8,9 @@ nearest false track of the lists within `PAUSE_S` before that has its last entry
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.object_list import Entries, ObjectLists, join_entries, take_entries
@@ -18,6 +19,9 @@ from copem_replay.metrics.accuracy.aggregator import are_annotated
 from copem_replay.metrics.accuracy.statistics import AccuracySettings
 from copem_replay.metrics.episodes import Reference
 from copem_replay.metrics.matching import GHOST, Matches
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NEAR_M, PAUSE_S = 2.0, 1.0
 """How far apart neighbouring entries of a false track are at most, and for how long no list has one."""
@@ -55,6 +59,8 @@ class FalseTracks:
 
     def result(self, runs: int) -> pd.DataFrame:
         """The false tracks of all lists in `runs` runs, as `find_false_tracks`; where lists are of one, it is each."""
+        import pandas as pd
+
         entries = join_entries([part[0] for part in self._parts])
         class_ix, run_ix, list_ix = (np.concatenate([part[k] for part in self._parts]) for k in (1, 2, 3))
         found = find_false_tracks(
@@ -77,6 +83,8 @@ def find_false_tracks(
     contribution arrived first, of most entries first, null: not stated; `object_class`, `x_m`, `y_m` of its first
     entry, `to_x_m`, `to_y_m` of its last; `track_id`: null, where there is none; `existence`: the highest.
     """
+    import pandas as pd
+
     order = np.lexsort((entries["y_m"], entries["x_m"], list_ix, run_ix))
     entries, class_ix, run_ix, list_ix = entries[order], class_ix[order], run_ix[order], list_ix[order]
     number = np.full(len(order), -1)
@@ -112,6 +120,8 @@ LISTED = 5
 
 def describe_false_tracks(rows: pd.DataFrame) -> str:
     """In words the false tracks of a configuration in one run, the longest first, `LISTED` at most; `none`."""
+    import pandas as pd
+
     ranked = rows.iloc[np.lexsort((rows["begins_s"], -rows["lasts_s"].round(6)))]  # rounding decides nothing
     told = [
         f"{row.object_class} at ({row.x_m:.0f}, {row.y_m:.0f}) m from {row.begins_s:.1f} s on for {row.lasts_s:.2f} s"

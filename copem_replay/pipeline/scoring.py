@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.tracks import Float, Tracks
 from copem_replay.experiment.schema import Experiment
@@ -29,6 +29,9 @@ from copem_replay.metrics.origin import Origins
 from copem_replay.pipeline.false_tracks import FalseTracks
 from copem_replay.pipeline.prepare import Replay, TruthCache
 from copem_replay.pipeline.receiver import ReceiverOutput
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)

@@ -272,7 +272,7 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
         _AT_A_PRICE: f"{better} than {{}}, but braking for nothing: ",
         WORSE: f"{worse} than {{}}: ",
         _SAME: "The same as {}: ",
-        _NEAR: f"Apart from {{}} by less than {scale.least}: ",
+        _NEAR: f"Within {scale.least} of {{}}: ",
         _ALIKE: "By as much in every pair, against {}: ",
         OPEN: f"No difference to {{}} is shown{_tell_too_few(pairs)}: ",
         "": "On these objects alone, without an interval, against {}: ",
@@ -476,9 +476,10 @@ def _tell_latencies(
     parts: list[str] = []
     for word, says in ((BETTER, f"{what} helps"), (OPEN, f"no difference to {none} is shown")):
         if word in judged:
-            last = [name for name in names if pairs[name].word == word][-1]
-            up_to = f"up to {latencies_s[last]:g} s of latency" if latencies_s[last] else "without latency"
-            parts.append(f"{up_to} {says}: {_tell_against(pairs[last], scale, none, first=not parts)}")
+            first, *_, last = [name for name in names if pairs[name].word == word] * 2
+            at = "up to" if word == BETTER else "at" if first == last else f"from {latencies_s[first]:g} to"
+            at = f"{at} {latencies_s[last]:g} s of latency" if latencies_s[last] else "without latency"
+            parts.append(f"{at} {says}: {_tell_against(pairs[last], scale, none, first=not parts)}")
     if WORSE in judged:
         first = names[judged.index(WORSE)]
         told = _tell_against(pairs[first], scale, none, first=not parts)

@@ -153,7 +153,7 @@ def _describe_rows(results: Results) -> Iterator[str]:
         yield "! Two logs tell no interval; three do."
     horizon_s, asked_s = results.provenance.horizon_used_s, results.experiment.measure.horizon_s
     if not math.isclose(horizon_s, asked_s):
-        yield f"Few are in range for {asked_s:g} s: means are up to {horizon_s:.3g} s."
+        yield f"Too few are in range for {asked_s:g} s: means are up to {horizon_s:.3g} s."
     yield ""
 
 

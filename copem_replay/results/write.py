@@ -201,14 +201,14 @@ def list_results(
     files += [NEEDLESS] * (experiment.needless is not None)
     for log in choose_logs(experiment, [recording.scene.log for recording in recordings]):
         for stem in list_stems(experiment):
-            place, shown_count = _place_stem(stem, log, recordings), _count_with_views(experiment)
+            place, shown_count = _place_stem(stem, log, recordings), _count_with_views(experiment, log)
             files += [name for exporter in exporters for name in exporter.files(place, shown_count)]
     return sorted(files)
 
 
-def _count_with_views(experiment: Experiment) -> int:
-    """How many of the shown configurations have views of their own: all but the truth, unless it is alone."""
-    shown = experiment.shown()
+def _count_with_views(experiment: Experiment, log: str) -> int:
+    """How many of the shown configurations have views of their own in a log: all but the truth, unless it is alone."""
+    shown = resolve_for_log(experiment, log).shown()
     return sum(configuration.units != TRUTH for configuration in shown.values()) or len(shown)
 
 
@@ -262,7 +262,7 @@ def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporte
     notes: list[str] = []
     for log in choose_logs(study.experiment, [one.name for one in study.logs]) if exporters else ():
         for shown in select_shown_runs(study, log):
-            stem, shown_count = _place_stem(shown.stem, log, study.logs), _count_with_views(study.experiment)
+            stem, shown_count = _place_stem(shown.stem, log, study.logs), _count_with_views(study.experiment, log)
             files = [exporter.files(stem, shown_count) for exporter in exporters]
             with place.may_fail([name for names in files for name in names]):
                 run = _make_run_to_export(log, shown, study)

@@ -83,7 +83,7 @@ def read_stories(folder: Path) -> dict[str, dict[str, str]]:
     told = {}
     for part in story_parts(load_study(folder))[1:]:
         text = unescape(re.sub(r"<svg.*</svg>", "", part, flags=re.DOTALL))
-        title, said = re.search(r"<h3[^>]*>(.*?): [^<]*</h3>", text), re.search(r"<p>(.*?)\.(?: <code|</p>)", text)
+        title, said = re.search(r"<h3[^>]*>(.*?): [^<]*</h3>", text), re.search(r"<p>(.*?)\.(?: <a | <code|</p>)", text)
         assert title
         assert said
         told[title[1]] = dict(clause.split(": ", 1) for clause in said[1].split("; "))

@@ -84,7 +84,8 @@ def test_ids_that_change_and_others_than_the_truth(path: Path) -> None:
     recording, found = lists_of(path)
     assert odd(recording, found, DELAY_S) == [
         "its ids change: object 1 has 12 ids in 22.6 s and changes between them 11 times",
-        "227 of 454 entries match nothing in the truth (not labelled, or false); all count as false positives",
+        "227 of 454 entries match nothing in the truth (not labelled, or false); those of a measured class count as "
+        "false positives",
     ]
 
 

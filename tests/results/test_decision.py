@@ -72,7 +72,7 @@ class TestLatencies:
         )
         assert found.sentence == (
             "Without latency cooperation helps: an object is known after 0.00 s on average against 0.70 s with PEM "
-            "alone, by 0.70 s [0.60, 0.80]; up to 1 s of latency no difference to PEM alone is shown: 0.90 s, 0.20 s "
+            "alone, by 0.70 s [0.60, 0.80]; at 1 s of latency no difference to PEM alone is shown: 0.90 s, 0.20 s "
             "later [-0.10, 0.50]."
         )
 
@@ -109,7 +109,7 @@ class TestGroups:
     def test_nobody_is_crowned_by_a_hair(self, apart_s: float, crowned: bool) -> None:
         """All intervals exclude 0."""
         found = decide_compared(compared("ttd_rmst_s", ("a", 1 - apart_s, 1.0, -apart_s - 1e-5, -apart_s + 1e-5)))
-        assert found.sentence.startswith("Sooner than PEM" if crowned else "Apart from PEM (known")
+        assert found.sentence.startswith("Sooner than PEM" if crowned else "Within 0.05 s of PEM (known")
         assert found.best == (("a",) if crowned else ("a", "PEM"))
 
     def test_the_best_has_a_better_mean_than_all_and_no_interval_that_excludes_0(self) -> None:
@@ -271,7 +271,7 @@ class TestParts:
     def test_latencies_between_which_the_help_ends_are_the_sentence(self, tmp_path: Path) -> None:
         [told] = approached(tmp_path, car="[ego]", at_once="[ego, mast]", late="[ego, mast], latency_s: 2.9")
         assert told.startswith("Without latency cooperation helps: an object is known after 0.00 s on average against ")
-        assert "; up to 2.9 s of latency no difference to car alone is shown: 2.90 s, 0.20 s later [" in told
+        assert "; at 2.9 s of latency no difference to car alone is shown: 2.90 s, 0.20 s later [" in told
 
     def test_without_a_car_the_best_single_unit_is_alone(self, tmp_path: Path) -> None:
         """Each of two masts alone; together they know no sooner than the better one."""

@@ -93,7 +93,7 @@ def test_a_horizon_that_few_last_is_said(tmp_path: Path) -> None:
     results = replay(tmp_path, 5, measure={"onset": {"kind": "in_range", "range_m": 60}, "horizon_s": 50})
     used_s = results.provenance.horizon_used_s
     assert used_s < 50
-    assert f"Few are in range for 50 s: means are up to {used_s:.3g} s." in screen(results)
+    assert f"Too few are in range for 50 s: means are up to {used_s:.3g} s." in screen(results)
 
 
 def test_of_nobody_there_is_no_table(tmp_path: Path) -> None:

@@ -65,13 +65,13 @@ def test_the_line_of_a_build_says_what_is_worse_and_what_is_better(tmp_path: Pat
     change = tell_change(found)
     assert change.head == "new against old: better and worse"
     assert change.sentence == (
-        "new against old: worse: late 0.30 s later [0.176, 0.424]; better: gnn 0.50 s sooner (all alike); 1 unchanged"
+        "new against old: worse: late 0.30 s later [0.18, 0.42]; better: gnn 0.50 s sooner (all alike); 1 unchanged"
     )
     assert change.differing == ("late", "gnn")
     lines, marked = format_comparison(found, change.differing)
     assert lines[0] == "each minus itself in old; --explain: every figure; --baseline: all against one"
     assert lines[-4:] == [
-        "      known", "gnn   0.50 s sooner (all alike)", "late  0.30 s later [0.176, 0.424] *", "ideal: unchanged"
+        "      known", "gnn   0.50 s sooner (all alike)", "late  0.30 s later [0.18, 0.42] *", "ideal: unchanged"
     ]  # fmt: skip
     assert marked == lines[-3:-1]
     assert max(map(len, lines[2:])) <= 80

@@ -5,6 +5,7 @@ Mostly an ego that stands at the origin and looks east, and pedestrians who are 
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -224,7 +225,9 @@ def test_six_units_are_named_in_their_view_and_apart(tmp_path: Path) -> None:
         if "Points3D:show_labels" in chunk.to_record_batch().schema.names
     ]
     named = list(choose_named_units(made.replay, made.given, np.array([30.0, 0.0, 0.0]), 0.0))
-    assert len(named) == len(overrides) == 6
+    of_views = Counter(str(chunk.entity_path).split("/")[2] for chunk in overrides)
+    assert len(named) == max(of_views.values()) == 6
+    assert sorted(of_views.values())[-2] <= 2, "others name those that told first"
     assert named[0] == "ego"
     numbers = sorted(int(name[1:]) for name in named if name != "ego")
     assert min(np.diff(numbers)) >= 3, "12 m"

@@ -290,7 +290,7 @@ def test_seven_configurations_a_file_and_nothing_dropped() -> None:
     assert [name for part in parts for name in part.configurations] == names
     assert [part.infix for part in split_into_files(names[:7])] == [""]
     assert [part.infix for part in split_into_files(names[:8])] == ["", ".configurations_8"]
-    beside = split_into_files(["base", *names[:8]], "base")
+    beside = split_into_files(["base", *names[:8]], dict.fromkeys(names[:8], "base"))
     assert [part.configurations for part in beside] == [("base", *names[:6]), ("base", *names[6:8])]
     assert [part.infix for part in beside] == ["", ".configurations_8-9"]
 

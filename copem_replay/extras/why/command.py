@@ -47,6 +47,7 @@ def why(
     from copem_replay.extras.why.api import PARTS
     from copem_replay.extras.why.api import why as compute
     from copem_replay.extras.why.screen import tell_explanation
+    from copem_replay.results.read import open_results
 
     folder = out or Path("out") / f"{experiment.stem}_why"
     if experiment.is_dir():
@@ -64,13 +65,15 @@ def why(
             progress=progress,
         ),
     )
-    print_notes(found.notes)
-    written = found.save(folder)
     whole = explain or bool(asked)
-    place = str(experiment) if experiment.is_dir() else "FOLDER"
+    print_notes(found.notes if whole or configuration else [note for note in found.notes if ": of " in note])
+    written = found.save(folder)
+    place, of_one = str(experiment) if experiment.is_dir() else "FOLDER", False
+    if experiment.is_dir():
+        of_one = len(open_results(experiment).provenance.logs) == 1
     if whole:
         print_blocks(list(found.blocks(width_of(sys.stdout))))
     else:
-        print_rows(tell_explanation(found, place))
+        print_rows(tell_explanation(found, place, of_one=of_one))
     print_line(f"{', '.join(path.name for path in written)} in {folder}{'' if whole else '; every figure: --explain'}")
     return 0

@@ -133,11 +133,13 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
     for row in of.head(_MOST_GROUPS).to_dict("records"):
         where = f" ({row['where']})" if row["where"] else ""
         objects, share = count_noun(int(row["objects"]), "object"), format_per_cent(float(row["lost_s"]) / lost_s)
-        words = f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share}), {describe_cause(str(row['cause']))}"
+        words = (
+            f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share} %), {describe_cause(str(row['cause']))}"
+        )
         example = f"copem-replay view FOLDER --object {row['example']} --log {row['log']}"
         words += where + describe_structure(float(row["structural_share"]))
-        name = link_story(str(row["log"]), str(row["example"]), f"{row['example_class']} {row['example']}")
-        lines.append(make_tag("span", f"{words}; such as ", name, " ", make_tag("code", example)))
+        story = link_story(str(row["log"]), str(row["example"]), f"{row['example_class']} {row['example']}")
+        lines.append(make_tag("span", f"{words}; such as ", story, " ", make_tag("code", example)))
     rest = len(of) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []
     head = make_tag("p", f"{name}: late for more than 1 s, {lost_s:.1f} s in all")

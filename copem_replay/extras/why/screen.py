@@ -20,14 +20,14 @@ _HEADERS = {"range": "out of view", "hidden": "hidden", "missed": "missed in sig
 """Causes whose words are too long for a header; of others the part before a colon."""
 
 
-def tell_explanation(explained: Explanation, folder: str) -> Iterator[str]:
-    """Lines. `folder`: of the results that `view` opens."""
+def tell_explanation(explained: Explanation, folder: str, *, of_one: bool) -> Iterator[str]:
+    """Lines. `folder`: of the results that `view` opens; `of_one`: they are of one log."""
     if explained.causes is not None:
         yield from [*_tabulate_seconds(explained.causes), ""]
     if explained.units is not None:
         yield from _tell_units(explained.units)
     if explained.triage is not None and explained.causes is not None:
-        yield from _tell_late(explained.triage, folder)
+        yield from _tell_late(explained.triage, folder, of_one=of_one)
     if explained.sensitivity is not None and explained.orders is not None:
         yield from _tell_orders(explained.sensitivity, explained.orders)
 
@@ -44,14 +44,15 @@ def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
         rows.setdefault((f"{unknown_s[name] + 0.0:.2f}", *cells), []).append(str(name))
     heads = [_HEADERS.get(str(cause), describe_cause(str(cause)).partition(":")[0]) for cause in shown]
     kept = [*rows.items()][:_MOST_ROWS]
-    table = [["", "unknown in all, s", *heads], *([_join_names(names), *cells] for cells, names in kept)]
+    table = [["", "unknown", *heads], *([_join_names(names), *cells] for cells, names in kept)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = [
         "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
         for row in table
     ]
     left = sum(len(names) for names in [*rows.values()][_MOST_ROWS:])
-    return [line.rstrip() for line in lines] + ([f"and {left} more in why.csv"] if left else [])
+    more = [f"and {left} more in why.csv"] if left else []
+    return [*(line.rstrip() for line in lines), *more, "Seconds to the end of each episode, beyond the limit of `run`."]
 
 
 def _join_names(names: list[str]) -> str:
@@ -72,10 +73,10 @@ def _tell_units(units: pd.DataFrame) -> list[str]:
     return [*shown, *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
 
 
-def _tell_late(groups: pd.DataFrame, folder: str) -> list[str]:
+def _tell_late(groups: pd.DataFrame, folder: str, *, of_one: bool) -> list[str]:
     """The group of late episodes that costs most, and how to look at one."""
     if not len(groups):
-        return [f"Nothing is unknown for more than {LATE_S:g} s in one run of twenty or more."]
+        return [f"No object is unknown for more than {LATE_S:g} s in 5 % of the runs or more."]
     worst = groups.loc[groups["lost_s"].idxmax()]
     where = f" ({worst['where']})" if worst["where"] else ""
     told = f"{worst['example_class']} {worst['example']}"
@@ -85,7 +86,7 @@ def _tell_late(groups: pd.DataFrame, folder: str) -> list[str]:
     return [
         f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {told}: "
         f"{describe_cause(str(worst['cause']))}{where}{how}.",
-        f"    copem-replay view {folder} --object {worst['example']} --log {worst['log']}",
+        f"    copem-replay view {folder} --object {worst['example']}" + ("" if of_one else f" --log {worst['log']}"),
     ]
 
 
