@@ -10,6 +10,7 @@ import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from benches import common
+from copem_replay.core.colours import configuration_colours
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import Scene
 from copem_replay.io.encodings.column_bytes import encode_messages
@@ -78,12 +79,13 @@ def writing() -> Iterator[common.Line]:
     rows, _ = summarise_rows(table, list(experiment.configurations), rates, horizon_s=settle_horizon(table, 5.0)[0])
     listed = sum(int(lists.fused.valid.sum()) for lists in run_tracks.values())
     shown = listed + len(ready.truth.frame_ix)
+    colours = configuration_colours(experiment.configurations, {"GT"})
     with common.scratch() as folder:
         mcap, rrd = folder / "w.mcap", folder / "w.rrd"
 
         def to_mcap() -> None:
             truth = draw_truth(replayed, table)
-            write_mcap(mcap, recordings[0].path, ready.scene, [run_tracks], table, {}, truth=truth)
+            write_mcap(mcap, recordings[0].path, ready.scene, [run_tracks], table, {}, truth=truth, colours=colours)
 
         seconds, cpu_s = common.best(to_mcap, 3), common.interleaved([to_mcap], 3)[0]
         yield {"mcap_objects_per_s": round(shown / seconds), "mcap_objects_per_cpu_s": round(shown / cpu_s)}
