@@ -12,7 +12,7 @@ at the capture is there. Objects count measured or not, moving or not: an entry 
    number scattered from its place; never the one that happens to be closest, outermost, or first in an experiment.
 2. Of the others, the preferred first, each becomes the match of the nearest object within its gate that has none yet:
    of two pedestrians side by side the entries of both may lie nearer to one of them. An entry at the very place of a
-   preferred one is a copy of it, and becomes no match.
+   preferred one is a copy of it: it becomes no match, and is about the object that the preferred one is about.
 3. What is then left is a duplicate of its nearest object, or a ghost where there is none within the gate.
 
 Entries of one list may tell of different instants; an object has one match in a list, whichever they are. The order of
@@ -230,7 +230,11 @@ def _match_list(
             entries[i].x_m, entries[i].y_m, class_ix[i], bounds[f], bounds[f + 1], gate_m, agree,
             row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True, origins, which, i,
         )  # fmt: skip
-        if p >= 0 and not _is_copy(entries, i, others[:j]):
+        original = _find_original(entries, i, others[:j])
+        if original >= 0:
+            if entries[original].captured_s == entries[i].captured_s and class_ix[original] == class_ix[i]:
+                object_ix[i], out.x_m[i], out.y_m[i] = object_ix[original], out.x_m[original], out.y_m[original]
+        elif p >= 0:
             o = row_object_ix[p]
             object_ix[i], role[i], out.x_m[i], out.y_m[i] = o, MATCH, row_x_m[p], row_y_m[p]
             match_of[o] = i
@@ -300,11 +304,12 @@ def _are_at_one_place(entries: Entries, i: int, j: int) -> bool:
 
 
 @borrowing
-def _is_copy(entries: Entries, i: int, preferred: Int) -> bool:
-    copy = False
+def _find_original(entries: Entries, i: int, preferred: Int) -> int:
+    # The most preferred entry at the very place of entry i; −1: none.
     for j in preferred:
-        copy |= _are_at_one_place(entries, i, j)
-    return copy
+        if _are_at_one_place(entries, i, j):
+            return int(j)
+    return -1
 
 
 @borrowing

@@ -92,7 +92,7 @@ def test_a_copy_is_no_match_of_a_neighbour() -> None:
     thrice = [entry(0.1, existence=e) for e in (0.9, 0.9, 0.5)]
     assert sorted(of_one_list(*thrice, objects=objects)) == [(0, MATCH), (0, DUPLICATE), (0, DUPLICATE)]
     apart = [entry(0.1, existence=0.9), *(entry(0.2, existence=e) for e in (0.8, 0.7))]
-    assert of_one_list(*apart, objects=objects) == [(0, MATCH), (1, MATCH), (0, DUPLICATE)]
+    assert of_one_list(*apart, objects=objects) == [(0, MATCH), (1, MATCH), (1, DUPLICATE)]
 
 
 def test_the_rest_take_the_nearest_object_that_is_free() -> None:
