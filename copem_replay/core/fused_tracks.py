@@ -124,7 +124,7 @@ class FusedTracks:
         received = self.received
         arrives_s = received.common_arrives_s[received.frame_ix]
         return EntrySources(
-            received.valid, received.row_captured_s, arrives_s, received.row_unit_ix, self.entries, self.start
+            received.valid, received.entry_captured_s, arrives_s, received.row_unit_ix, self.entries, self.start
         )
 
     @cached_property

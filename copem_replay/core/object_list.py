@@ -121,6 +121,8 @@ class Inputs:
     are in a random order that is the same however the recording was ordered. Times are seconds since the log's start.
     `ListFusion.fuse` takes them.
 
+    An entry of a unit that fuses others may be older than its list: `captured_s` of the entry says so.
+
     For a unit with partial messages `newest` names a list that is not among those that `arrived`: the newest entry of
     each of its objects, each with its own `captured_s`.
 

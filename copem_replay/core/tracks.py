@@ -221,6 +221,7 @@ class Tracks:
     yaw_var_rad2: Float | None = None
     size_var_m2: Float | None = None  # of length, width and height alike
     speed_var_m2ps2: Float | None = None
+    entry_age_s: Float | None = None  # how long before its list each row was captured, in lists that a unit has fused
 
     def __post_init__(self) -> None:
         E, P, F = len(self.unit_ix), len(self.frame_ix), len(self.stamp_ns)
@@ -305,8 +306,13 @@ class Tracks:
 
     @cached_property
     def row_captured_s(self) -> Float:
-        """(P,) when each row was captured."""
+        """(P,) when the list of each row was captured."""
         return self.captured_s[self.frame_ix]
+
+    @cached_property
+    def entry_captured_s(self) -> Float:
+        """(P,) when each row was captured: with its list, but for lists of one run that a unit has fused."""
+        return self.row_captured_s if self.entry_age_s is None else self.row_captured_s - self.entry_age_s[0]
 
     @cached_property
     def by_frame(self) -> tuple[Int, Int]:
@@ -389,8 +395,8 @@ class Tracks:
 def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
     """Tracks of several units as one; each piece has lists, and units, of its own. `units`: of all, in their order.
 
-    Values of a piece that all runs share are repeated where another's differ; a variance that only some have is 0 for
-    the others.
+    Values of a piece that all runs share are repeated where another's differ; a variance, or an age, that only some
+    have is 0 for the others.
     """
     none = np.empty(0, dtype=np.int64)
     row_offset = np.concatenate([[0], np.cumsum([len(p.frame_ix) for p in pieces])]).astype(np.int64)
@@ -402,7 +408,7 @@ def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
 
     def rows(name: str) -> Any:
         columns = [getattr(p, name) for p in pieces]
-        if name in UNCERTAINTIES:
+        if name in _OPTIONAL:
             if all(column is None for column in columns):
                 return None
             columns = [
@@ -458,12 +464,13 @@ def splice_rows(pieces: Sequence[Tracks], *, states: bool = True) -> tuple[Track
 
 def _stateless(rows: int) -> dict[str, Any]:
     """The columns of states that are not needed."""
-    return {name: None if name in UNCERTAINTIES else np.broadcast_to(0.0, (1, rows)) for name in STATES}
+    return {name: None if name in _OPTIONAL else np.broadcast_to(0.0, (1, rows)) for name in STATES}
 
 
 VALUES = ("x_m", "y_m", "z_m", "yaw_rad", "vx_mps", "vy_mps", "length_m", "width_m", "height_m")
-UNCERTAINTIES = tuple(f.name for f in fields(Tracks) if f.default is None)
-STATES = (*VALUES, *UNCERTAINTIES)
+_OPTIONAL = tuple(f.name for f in fields(Tracks) if f.default is None)
+UNCERTAINTIES = _OPTIONAL[:-1]  # the last is `entry_age_s`
+STATES = (*VALUES, *_OPTIONAL)
 """The columns of a state."""
 
 

@@ -66,7 +66,15 @@ def check_references(source: ExperimentSource) -> Iterator[str]:
     # A misspelt key is told of by itself, not by each name below it.
     meant = {name: data[key] for key in data for name in find_meant_key((key,), list(Experiment.model_fields))} | data
     names = {section: [str(name) for name in _mapping(meant, section)] for section in _SECTIONS.values()}
-    for check in (_check_configurations, _check_names, _check_places, _check_exact, _check_keys, _check_sweep):
+    for check in (
+        _check_configurations,
+        _check_names,
+        _check_members,
+        _check_places,
+        _check_exact,
+        _check_keys,
+        _check_sweep,
+    ):
         yield from (source.at(key, message) for key, message in check(data, names))
     yield from check_criteria(source, data)
 
@@ -75,6 +83,7 @@ _SECTIONS: Final = {"PEM": "pems", "unit": "units", "configuration": "configurat
 _BY_UNIT: Final = ("default",)
 _NAMED: Final[tuple[tuple[tuple[str, ...], str, tuple[str, ...], tuple[str, ...]], ...]] = (
     (("units", EACH, "pem"), "PEM", (), ()),
+    (("units", EACH, "fuses", ITEMS), "unit", (), ()),
     (("configurations", EACH, "inputs", ITEMS), "unit", (), ()),
     (("configurations", EACH, "units", ITEMS), "unit", (), ()),
     (("configurations", EACH, "latency_s", NAMES), "unit", (), _BY_UNIT),
@@ -128,6 +137,35 @@ def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
         yield from _check_link((*key, "link"), configuration.get("link"), received, names)
 
 
+def _check_members(data: Mapping[str, Any], _: Names) -> Problems:
+    """Units that cannot be fused by another one, and configurations that would hear one twice."""
+    units, fused_by = dict(_items(data, "units")), dict[str, str]()
+    fusing = {name: _list_texts(unit.get("fuses")) or [] for name, unit in units.items()}
+    for name, members in fusing.items():
+        places = {str(units[one].get("on")) for one in members if one in units and units[one].get("recorded") is None}
+        for k, one in enumerate(members):
+            key: Key = ("units", name, "fuses", k)
+            member = units.get(one, {})
+            if one == name:
+                yield key, f"unit {name!r} cannot fuse itself"
+            elif one in fused_by:
+                yield key, f"unit {one!r} is fused by {fused_by[one]!r} already; a list counts once"
+            elif member.get("fuses") is not None:
+                yield key, f"unit {one!r} fuses others itself; chains are one level deep: name its members"
+            elif isinstance(member.get("on"), dict) or len(places) > 1:
+                what = "is carried by several objects" if isinstance(member.get("on"), dict) else "moves apart from it"
+                yield key, f"unit {one!r} {what}; expected members on one object, or all at places"
+            for what in ("sends", "clock"):
+                if member.get(what) is not None:
+                    yield ("units", one, what), f"what {one!r} lists leaves by {name!r}; say `{what}` there"
+            fused_by.setdefault(one, name)
+    for key, listed in find_values(data, "configurations", EACH, "units"):
+        own = _list_texts(listed) or []
+        for k, one in enumerate(own):
+            if fused_by.get(one) in own:
+                yield (*key, k), f"unit {one!r} comes by {fused_by[one]!r} already; leave one of both out"
+
+
 def _check_link(key: Key, link: object, received: Sequence[str], names: Names) -> Problems:
     """Undefined links, and units that send by links and are undefined or not among those `received`."""
     by_unit = isinstance(link, Mapping) and "kind" not in link
@@ -149,6 +187,8 @@ def _check_places(data: Mapping[str, Any], names: Names) -> Problems:
     measured = {} if place == "ego" else _mapping(data, "units", str(place))
     if measured.get("recorded") is not None and all(measured.get(one) is None for one in ("on", "at", "at_wgs84")):
         yield key, f"unit {place!r} has no place; say `at: [x, y]` or `on: <object id>` of it"
+    if measured.get("fuses") is not None:
+        yield key, f"unit {place!r} fuses others and has no place of its own; name one of its members"
     if isinstance(measured.get("on"), dict):
         yield key, f"unit {place!r} is carried by several objects; name a single one"
     for entry, own in find_values(data, "logs", ITEMS, "units", EACH):
@@ -175,6 +215,7 @@ def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
             why.append(f"configuration {name!r}: {what}")
     for key, what in (
         ("recorded", "is recorded: nothing says how probable its lists were"),
+        ("fuses", "fuses the lists of others, which has no closed form"),
         ("outages", "has outages, in which all objects miss all lists together: that has no closed form"),
     ):
         why += [f"unit {name!r} {what}" for name, unit in units if unit.get(key) is not None][:1]
@@ -290,6 +331,7 @@ def _list_memories(data: Mapping[str, Any], pem: str) -> list[Any]:
 
 
 def _list_modelled_units(data: Mapping[str, Any]) -> list[str]:
+    """The units that are not recorded."""
     return [name for name, unit in _items(data, "units") if unit.get("recorded") is None]
 
 

@@ -104,6 +104,11 @@ def _apply_units(experiment: Experiment, settings: LogSettings) -> dict[str, Uni
                 units[name] = Unit.model_validate(data)
             except ValidationError as error:
                 raise SettingsError(("units", name), data, error) from error
+    for name, unit in list(units.items()):  # a unit fuses those of its members that the log has
+        if unit.fuses is not None and not units.keys() >= set(unit.fuses):
+            there = tuple(member for member in unit.fuses if member in units)
+            units.pop(name)
+            units |= {name: unit.model_copy(update={"fuses": there})} if there else {}
     return units
 
 

@@ -7,7 +7,7 @@ Units are in the names of keys. References (a unit's `pem`, a configuration's `u
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -243,25 +243,33 @@ _NOT_RECORDED = {
 }
 
 
+_OF_A_SENSOR = ("on", "at", "at_wgs84", "offset_m", "yaw_deg", "height_m", "ground_z_m", "phase_s")
+
+
 class Unit(Placement):
-    """A perception unit: its place, and the PEM or the `recorded` topic of its lists.
+    """A perception unit: its place, and the PEM or the `recorded` topic of its lists, or the units that it `fuses`.
 
     A recorded unit has no PEM, and needs a place only where distances are measured from it. `ready`: processing time
-    from capture until a list can be sent; `sends`: which lists and objects it sends.
+    from capture until a list can be sent; `sends`: which lists and objects it sends. A unit that fuses lists what its
+    `fusion` makes of its members' lists, whenever one comes, or at `rate_hz`; `max_age_s`: how old a list it uses.
 
     >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
     True
     """
 
     recorded: RecordedTopic | None = None
+    fuses: Annotated[tuple[Id, ...], Field(min_length=1)] | None = _UNSAID
+    fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] | None = _UNSAID
+    max_age_s: Positive | None = _UNSAID
     ready: Delay | None = Field(default=None, exclude_if=lambda ready: ready is None)
     sends: Sends | None = Field(default=None, exclude_if=lambda sends: sends is None)
 
     @model_validator(mode="after")
     def _place(self) -> Self:
-        if (self.pem is None) == (self.recorded is None):
-            raise ValueError("expected one of `pem: <name>` and `recorded: {topic: …}`")
+        if sum(what is not None for what in (self.pem, self.recorded, self.fuses)) != 1:
+            raise ValueError("expected one of `pem: <name>`, `recorded: {topic: …}` and `fuses: [<unit>, …]`")
         places = (self.on, self.at, self.at_wgs84)
+        self._check_fusing()
         if self.at_wgs84 is not None and len(self.at_wgs84) == 3 and "yaw_deg" in self.model_fields_set:
             raise error_at_key("yaw_deg", "the heading is the third number of at_wgs84; expected one of both")
         if self.recorded is not None:
@@ -270,6 +278,7 @@ class Unit(Placement):
                     raise error_at_key(key, f"a recorded unit {why}; only for units with a pem")
             if self.rate_hz is not None or isinstance(self.on, Carriers) or sum(map(bool, places)) > 1:
                 raise ValueError("recorded: goes with one place, `on` an object or `at` a point, and without rate_hz")
+        if self.pem is None:
             return self
         if sum(place is not None for place in places) != 1:
             raise ValueError(
@@ -283,6 +292,24 @@ class Unit(Placement):
         if self.phase_s and self.rate_hz is None:
             raise ValueError("phase_s: needs rate_hz (without it there is one list per frame of the truth)")
         return self
+
+    def _check_fusing(self) -> None:
+        """Raises ValueError for keys of a unit that fuses where none does, and for those that it does not take."""
+        for key in () if self.fuses is not None else ("fusion", "max_age_s"):
+            if getattr(self, key) is not None:
+                raise error_at_key(key, "only for a unit that `fuses` others")
+        for key in _OF_A_SENSOR if self.fuses is not None else ():
+            if getattr(self, key) != Unit.model_fields[key].default:
+                raise error_at_key(key, "a unit that fuses is where its first member is, and lists when lists come")
+        if isinstance(self.fusion, IdealFusion) and self.fusion.combine == "posterior":
+            raise error_at_key("fusion", "posterior draws anew for each receiver; a unit that fuses has `samples`")
+
+    def as_configuration(self) -> Configuration:
+        """A unit that fuses, as a configuration of its members."""
+        return Configuration(
+            units=self.fuses or (), fusion=self.fusion or IdealFusion(), issue_hz=self.rate_hz,
+            max_age_s=self.max_age_s or 1.0,
+        )  # fmt: skip
 
 
 class Configuration(Frozen):
@@ -494,7 +521,16 @@ class Experiment(Frozen):
     @property
     def modelled(self) -> dict[str, Unit]:
         """The units that have a PEM."""
-        return {name: unit for name, unit in self.units.items() if unit.recorded is None}
+        return {name: unit for name, unit in self.units.items() if unit.pem is not None}
+
+    @property
+    def fusing(self) -> dict[str, Unit]:
+        """The units that fuse the lists of others."""
+        return {name: unit for name, unit in self.units.items() if unit.fuses is not None}
+
+    def list_sensing(self, names: Iterable[str]) -> tuple[str, ...]:
+        """The units, and in place of those that fuse their members."""
+        return tuple(one for name in names for one in (self.units[name].fuses or (name,)))
 
     @property
     def recorded(self) -> dict[str, RecordedTopic]:
@@ -511,7 +547,8 @@ class Experiment(Frozen):
         if configuration.units == "truth":
             return ()
         if configuration.units == "all":
-            return tuple(self.modelled)
+            members = {one for unit in self.fusing.values() for one in unit.fuses or ()}
+            return tuple(name for name, unit in self.units.items() if unit.recorded is None and name not in members)
         return tuple(name for name in self.units if name in configuration.units)
 
     def links_of(self, name: str) -> list[UnitLinks]:

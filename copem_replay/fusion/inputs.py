@@ -28,7 +28,7 @@ def make_entry_lists(seen: Tracks, claims: EntryClaims, drawn: Float, *, without
         if len(values) == 1:
             rows[name] = values[0]
     rows["existence"], rows["class_probability"], rows["track_id"] = claims
-    rows["captured_s"], rows["unit_ix"] = seen.row_captured_s, seen.row_unit_ix
+    rows["captured_s"], rows["unit_ix"] = seen.entry_captured_s, seen.row_unit_ix
     entries = take_entries(rows, picked)
     run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
     for name, values in columns.items():

@@ -277,10 +277,13 @@ def _has_track_twice(answer: ObjectLists) -> bool:
 
 
 def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:
-    """(N,) whether a list with the capture that an entry states has arrived when the entry's list is issued."""
-    captured_s, which = np.unique(inputs.captured_s, return_inverse=True)
+    """(N,) whether a list, or an entry, of the capture that an entry states has arrived when its list is issued."""
+    lengths, entry_s = np.diff(inputs.lists.start), inputs.lists.entries["captured_s"]
+    older = np.flatnonzero(entry_s != np.repeat(np.tile(inputs.captured_s, len(lengths)), lengths.ravel()))
+    frame = np.repeat(np.tile(np.arange(len(inputs.captured_s)), len(lengths)), lengths.ravel())[older]
+    captured_s, which = np.unique(np.append(inputs.captured_s, entry_s[older]), return_inverse=True)
     first_s = np.full(len(captured_s), np.inf)
-    np.minimum.at(first_s, which, inputs.arrives_s)
+    np.minimum.at(first_s, which, np.append(inputs.arrives_s, inputs.arrives_s[frame]))
     arrived: Bool = np.zeros(len(answer.entries), dtype=bool)
     if len(captured_s):
         _mark_arrived(

@@ -82,7 +82,7 @@ def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, 
 def _first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
     episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), seen.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode, captured_s = episode_of[seen.row_object_ix], seen.row_captured_s
+    episode, captured_s = episode_of[seen.row_object_ix], seen.entry_captured_s
     in_units = np.array([name in units for name in seen.units], dtype=bool)[seen.row_unit_ix]
     rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(seen.common_arrives_s)[seen.frame_ix])
     during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S

@@ -70,7 +70,7 @@ class OriginLists:
         return Holdings(
             int(self.goes_back), self.partial, start, frame, arrives_s[frame], lists.captured_s[frame],
             lists.frame_unit_ix[frame], self.rows.valid, row, self.rows.row_captured_s[row],
-            self.rows.frame_ix[row], first_row, (len(first_row) - 1) // max(units, 1),
+            self.rows.entry_captured_s[row], self.rows.frame_ix[row], first_row, (len(first_row) - 1) // max(units, 1),
             self.own_body_ix, issue_s, self.max_age_s, way_s,
             np.full((units, 2), np.nan), np.empty(units, np.int64), np.empty(len(frame), np.int64),
         )  # fmt: skip
@@ -112,6 +112,7 @@ class Holdings(NamedTuple):
     valid: Bool  # (S | 1, P)
     row: Int
     row_captured_s: Float
+    row_entry_s: Float
     row_frame: Int
     first_row: Int
     objects: int  # rows of unit u and object o begin at first_row[u · objects + o + 1]
@@ -147,8 +148,8 @@ def _find_newest_list(h: Holdings, u: int, k: int, captured_s: float) -> int:
 
 
 @borrowing
-def _holds(h: Holdings, s: int, a: int, o: int) -> bool:
-    # Whether list a holds object o in run s.
+def _holds(h: Holdings, s: int, a: int, o: int, not_before_s: float) -> bool:
+    # Whether list a holds object o in run s, by an entry that was captured early enough.
     if o + 1 >= h.objects or o == h.own_body_ix:
         return False
     group = h.unit_ix[a] * h.objects + o + 1
@@ -156,8 +157,9 @@ def _holds(h: Holdings, s: int, a: int, o: int) -> bool:
     for q in range(first + count_below(h.row_captured_s[first:after], h.captured_s[a]), after):
         if h.row_captured_s[q] > h.captured_s[a]:
             break
-        if h.row_frame[q] == h.frame[a]:
-            return bool(h.valid[s if len(h.valid) > 1 else 0, h.row[q]])
+        if h.row_frame[q] == h.frame[a] and h.valid[s if len(h.valid) > 1 else 0, h.row[q]]:
+            if h.row_entry_s[q] >= not_before_s:
+                return True
     return False
 
 
@@ -182,7 +184,7 @@ def find_holding_lists(origins: Origins, s: int, k: int, i: int, o: int, not_bef
             else:
                 taken_in = h.arrives_s[a] <= h.issue_s[k] + SAME_INSTANT_S
                 in_use = not bounded or h.arrives_s[a] >= oldest_s
-                holds = taken_in and in_use and _holds(h, s, a, o)
+                holds = taken_in and in_use and _holds(h, s, a, o, not_before_s)
             if holds:
                 h.holding[n] = a
                 n += 1

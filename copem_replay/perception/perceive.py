@@ -283,15 +283,25 @@ def apply_pose_errors(
         if (placed := unit.placed) is None:
             continue
         rows = np.flatnonzero(seen.row_unit_ix == seen.units.index(name))
-        frames, of_row = np.unique(seen.frame_ix[rows], return_inverse=True)
-        drawn = _draw_pose_errors(scene, seen, frames, placed, (setup.seed, name, runs))
         # From the true place of the unit.
         from_unit_m = view.range_m[rows] * np.stack([np.cos(view.bearing_rad[rows]), np.sin(view.bearing_rad[rows])])
-        at_m = np.stack([true.x_m[0, rows], true.y_m[0, rows]]) - from_unit_m
-        seen = _shift_rows(seen, rows, at_m, tuple(error[:, of_row] for error in drawn))
-        if placed.stated:
-            seen = _state_pose_covariance(seen, rows, from_unit_m, placed)
+        true_m = np.stack([true.x_m[0, rows], true.y_m[0, rows]])
+        seen = displace_rows(scene, seen, rows, true_m - from_unit_m, from_unit_m, placed, (setup.seed, name, runs))
     return seen
+
+
+def displace_rows(
+    scene: Scene, seen: Tracks, rows: Int, at_m: Float, from_unit_m: Float, placed: PoseError,
+    address: tuple[int, str, Int],
+) -> Tracks:  # fmt: skip
+    """Rows (K,) of one unit moved by its pose errors about its place `at_m`; they are `from_unit_m` away, (2, K) each.
+
+    `address`: seed, unit, runs.
+    """
+    frames, of_row = np.unique(seen.frame_ix[rows], return_inverse=True)
+    drawn = _draw_pose_errors(scene, seen, frames, placed, address)
+    seen = _shift_rows(seen, rows, at_m, tuple(error[:, of_row] for error in drawn))
+    return _state_pose_covariance(seen, rows, from_unit_m, placed) if placed.stated else seen
 
 
 def _shift_rows(seen: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) -> Tracks:
@@ -354,7 +364,7 @@ def clock_errors_s(
     scene: Scene, units: tuple[str, ...], setup: PerceptionSetup, captured_s: Float, unit_ix: Int, run: int
 ) -> Float | None:
     """(F,) seconds that the clocks of units (U,) add to the captures of lists (F,) in one run; None: no clock errs."""
-    clocks = {name: unit.clock for name, unit in setup.modelled.items() if unit.clock is not None and name in units}
+    clocks = {name: unit.clock for name, unit in setup.units.items() if unit.clock is not None and name in units}
     if not clocks:
         return None
     rng, zero = CounterRng(setup.seed, scene.log), np.zeros(1, dtype=np.int64)
@@ -383,7 +393,9 @@ def remove_outages(scene: Scene, seen: Tracks, setup: PerceptionSetup, runs: Int
 
 def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:
     """(S, F) lists of `tracks` that are not made in the runs (S,), as their unit is down; None: all are made."""
-    outages_by_unit = {name: unit.outages for name, unit in setup.modelled.items() if unit.outages is not None}
+    outages_by_unit = {
+        name: unit.outages for name, unit in setup.units.items() if unit.outages is not None and name in tracks.units
+    }
     if not outages_by_unit:
         return None
     down: Bool = np.zeros((len(runs), len(tracks.stamp_ns)), dtype=bool)

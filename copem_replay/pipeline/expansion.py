@@ -166,17 +166,17 @@ class ExpandedExperiment(Experiment):
     @property
     def outages(self) -> bool:
         """Whether a unit at times makes no lists."""
-        return any(unit.outages is not None for unit in self.modelled.values())
+        return any(unit.outages is not None for unit in self.units.values())
 
     @property
     def ready(self) -> dict[str, LatencyModel]:
         """By unit the time from capture until a list can be sent, of those that state one."""
-        return {name: unit.ready for name, unit in self.modelled.items() if unit.ready is not None}
+        return {name: unit.ready for name, unit in self.units.items() if unit.ready is not None}
 
     @property
     def sends(self) -> dict[str, Sends]:
         """By unit the rules of what it sends, of those that do not send all of their lists."""
-        return {name: unit.sends for name, unit in self.modelled.items() if unit.sends is not None}
+        return {name: unit.sends for name, unit in self.units.items() if unit.sends is not None}
 
     @property
     def partial(self) -> list[str]:
@@ -201,7 +201,7 @@ class ExpandedExperiment(Experiment):
         """Whether lists, or their arrivals, differ from run to run: each run then has receiver instants of its own."""
         return (
             self.outages
-            or bool(self.sends)
+            or bool(self.sends or self.fusing)
             or any(ready.fixed_s is None for ready in self.ready.values())
             or any(one.link.drawn for name in self.configurations for one in self.links_of(name))
         )
@@ -309,6 +309,19 @@ def _replace_units(
     )  # fmt: skip
     result._has_areas = experiment.has_areas
     return result
+
+
+def expand_members(experiment: ExpandedExperiment) -> ExpandedExperiment:
+    """The experiment in which each unit that fuses is a configuration of its members, and no unit."""
+    kept = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
+    names = list(experiment.units)
+    given = {name: getattr(experiment, name) for name in Experiment.model_fields}
+    given["configurations"] = {name: unit.as_configuration() for name, unit in experiment.fusing.items()}
+    return _replace_units(
+        Experiment.model_construct(**given),
+        {names[k]: experiment.units[names[k]] for k in kept},
+        tuple(experiment.named[k] for k in kept), tuple(experiment.carrier[k] for k in kept), experiment.share[kept],
+    )  # fmt: skip
 
 
 def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:

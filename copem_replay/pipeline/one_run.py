@@ -18,6 +18,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import find_carrier
+from copem_replay.pipeline.chain import fuse_members
 from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
 from copem_replay.pipeline.receiver import Receivers
@@ -62,7 +63,7 @@ class RunTracks:
         replay, measure = self.replay, self.experiment.measure
         units = replay.expand(self.experiment)
         [group] = group_runs(units, replay.scene.log, np.array([self.run]))
-        receivers = Receivers(Transmission(replay, units, group))
+        receivers = Receivers(Transmission(fuse_members(replay, units, group), units, group))
         for world in receivers.worlds():
             truth_cache, result = replay.truth_cache_of(world.chunk), {}
             for name in units.configurations:

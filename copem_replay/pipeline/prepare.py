@@ -23,6 +23,7 @@ from copem_replay.core.interpolation import interpolate_at_instants, interpolate
 from copem_replay.core.tracks import (
     AGREE,
     CLASSES,
+    SAME_INSTANT_S,
     Bool,
     Float,
     Int,
@@ -75,7 +76,12 @@ def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> 
     rows = observation_rows(scene, truth, experiment)
     fusions = [one.fusion for one in experiment.configurations.values()]
     whole = any(isinstance(one, IdealFusion) and one.memory is not None for one in fusions)
-    if rows <= ROWS_AT_ONCE or whole or not all(one.resumable for one in fusions if isinstance(one, ListFusion)):
+    if (
+        rows <= ROWS_AT_ONCE
+        or whole
+        or experiment.fusing
+        or not all(one.resumable for one in fusions if isinstance(one, ListFusion))
+    ):
         return (TimeChunk(),)
     _, bounds = truth.by_frame
     pieces = int(-(-rows // ROWS_A_CHUNK))
@@ -229,6 +235,21 @@ class Replay:
         keep = np.repeat(np.isin(self.truth.object_ix, self.episodes.object_ix), np.diff(self.truth.start))
         return self.truth if keep.all() else self.truth.take_rows(np.flatnonzero(keep), states=False)
 
+    def with_units(self, expanded: ExpandedExperiment) -> Replay:
+        """This log for an experiment that lacks units which fuse."""
+        return self._keep_observed(replace(self, expanded=expanded))
+
+    def with_recorded(self, recorded: RecordedUnits) -> Replay:
+        """This log with other recorded lists, as those of one run."""
+        paths_of = None if self.paths_of is None else self.paths_of.with_recorded(recorded)
+        return self._keep_observed(replace(self, recorded=recorded, paths_of=paths_of))
+
+    def _keep_observed(self, other: Replay) -> Replay:
+        """Another log, with what modelled units observe of this one: it is computed once."""
+        kept = ("_whole", "no_rows", "measured", "truth_cache", "_overview", "measured_truth")
+        vars(other).update({name: getattr(self, name) for name in kept})
+        return other
+
     def find_episodes_of(self, experiment: Experiment) -> Episodes:
         """The episodes of this log by another `measure`."""
         return _find_kept_episodes(self.scene, self.truth, self.placed, experiment)[0]
@@ -351,6 +372,13 @@ class Replay:
         ego = self.scene.object_ids[self.scene.ego_ix]
         is_aboard = np.isin(senders, [name for name, unit in expanded.modelled.items() if unit.on in ("ego", ego)])
         is_recorded = np.isin(senders, list(expanded.recorded))
+        captured_s = self.recorded_lists.captured_s
+        for name, unit in expanded.fusing.items():  # as far as its first member's list before
+            lists, own = np.flatnonzero(senders == name), np.flatnonzero(senders == (unit.fuses or ("",))[0])
+            place = np.searchsorted(captured_s[own], captured_s[lists] + SAME_INSTANT_S) - 1
+            before = own[np.maximum(place, 0)] if len(own) else lists
+            distance_m[lists], visible_share[lists] = distance_m[before], visible_share[before]
+            is_aboard[lists] = is_aboard[before]
         distance_m[is_aboard], visible_share[is_aboard] = 0.0, 1.0
         distance_m[is_recorded] = visible_share[is_recorded] = np.nan
         return RadioPath(distance_m, visible_share)

@@ -8,7 +8,7 @@ entry tells is what is stated, as a clock error is an error.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -59,7 +59,7 @@ from copem_replay.metrics.origin import (
     find_earliest_origin_s,
     find_longest_way_s,
 )
-from copem_replay.perception.perceive import EntryClaims, clock_errors_s
+from copem_replay.perception.perceive import clock_errors_s
 from copem_replay.pipeline.expansion import ExpandedExperiment
 from copem_replay.pipeline.world import States, Transmission, WorldChunk
 
@@ -204,11 +204,20 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
 
 @dataclass(frozen=True)
 class StatedCaptures:
-    """Captures of the lists (F,) of one run, as units state them and as they are; seconds since the log's start."""
+    """Captures of the lists (F,) of one run, as units state them and as they are; seconds since the log's start.
+
+    `older (3, E)`: the same three of entries that are older than their lists.
+    """
 
     stated_s: Float
     captured_s: Float
     arrives_s: Float
+    older: Float = field(default_factory=lambda: np.empty((3, 0)))
+
+    @cached_property
+    def told(self) -> Float:
+        """(3, F + E) what is stated, what is true, and arrivals, of all captures that entries may tell of."""
+        return np.concatenate([[self.stated_s, self.captured_s, self.arrives_s], self.older], axis=1)
 
     @property
     def ahead_s(self) -> float:
@@ -217,15 +226,16 @@ class StatedCaptures:
 
     def captured_between_s(self, stated_s: Float) -> tuple[Float, Float]:
         """The earliest and the latest true capture (K,) of the lists that state each instant (K,), one at least."""
-        order = np.lexsort((self.captured_s, self.stated_s))
-        first, after = (np.searchsorted(self.stated_s[order], stated_s, side=side) for side in ("left", "right"))
-        captured_s = self.captured_s[order]
+        told_s, captured_s, _ = self.told[:, np.lexsort((self.told[1], self.told[0]))]
+        first, after = (np.searchsorted(told_s, stated_s, side=side) for side in ("left", "right"))
         return captured_s[first], captured_s[after - 1]
 
     def as_told(self, lists: ObjectLists) -> ObjectLists:
         """The units' lists, one run of F, with stated captures."""
         entries = lists.entries.copy()
-        entries["captured_s"] = np.repeat(self.stated_s, np.diff(lists.start[0]))
+        lengths = np.diff(lists.start[0])
+        age_s = np.repeat(self.captured_s, lengths) - entries["captured_s"]
+        entries["captured_s"] = np.repeat(self.stated_s, lengths) - age_s
         return replace(lists, entries=entries)
 
     def true_lists(self, fused: ObjectLists, issue_s: Float) -> ObjectLists:
@@ -239,14 +249,13 @@ class StatedCaptures:
 
         An entry that tells of no list's stated capture is taken at its word.
         """
-        order = np.lexsort((self.captured_s, self.stated_s))
-        stated_s, arrives_s = self.stated_s[order], self.arrives_s[order]
+        stated_s, captured_s, arrives_s = self.told[:, np.lexsort((self.told[1], self.told[0]))]
         place: Int = np.searchsorted(stated_s, told_s + SAME_INSTANT_S, side="right") - 1
         while True:
             stated = (place >= 0) & (stated_s[np.maximum(place, 0)] >= told_s - SAME_INSTANT_S)
             early = stated & (arrives_s[np.maximum(place, 0)] > issue_s + SAME_INSTANT_S)
             if not early.any():
-                return np.where(stated, self.captured_s[order][np.maximum(place, 0)], told_s)
+                return np.where(stated, captured_s[np.maximum(place, 0)], told_s)
             place = np.where(early, place - 1, place)
 
 
@@ -256,7 +265,12 @@ def state_captures(scene: Scene, received: Tracks, experiment: ExpandedExperimen
     if error_s is None:
         return None
     arrives_s = received.common_arrives_s
-    return StatedCaptures(np.minimum(received.captured_s + error_s, arrives_s), received.captured_s, arrives_s)
+    stated_s = np.minimum(received.captured_s + error_s, arrives_s)
+    older, age_s = received.frame_ix[:0], np.empty(0)
+    if received.entry_age_s is not None:
+        older, age_s = received.frame_ix, received.entry_age_s[0]
+    of_entries = np.stack([stated_s[older] - age_s, received.captured_s[older] - age_s, arrives_s[older]])
+    return StatedCaptures(stated_s, received.captured_s, arrives_s, of_entries)
 
 
 @dataclass(frozen=True)
@@ -550,13 +564,9 @@ def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
     """
-    experiment, seen, recorded = world.experiment, world.sent("sampled"), world.recorded
+    experiment, seen = world.experiment, world.sent("sampled")
     rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
     words, (claims, same) = world.words, world.claims
-    if recorded is not None:
-        words = np.concatenate([words, np.arange(len(recorded.existence), dtype=np.uint64)])
-        same = np.concatenate([same, words[len(same) :]])
-        claims = claims.followed_by(EntryClaims(recorded.existence, recorded.class_probability, recorded.track_id))
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
     drawn = rng.uniform("order in the list", random_key, world.group.runs)
     lists = make_entry_lists(seen, claims, drawn, without_object_ix=ego)

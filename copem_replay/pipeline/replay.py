@@ -27,6 +27,7 @@ from copem_replay.metrics.detections_table import (
     stack_events,
 )
 from copem_replay.perception.sight import measure_sight
+from copem_replay.pipeline.chain import fuse_members
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, group_runs
 from copem_replay.pipeline.prepare import ROWS_A_CHUNK, Replay
 from copem_replay.pipeline.receiver import Receivers, states_needed
@@ -168,7 +169,7 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
     fused = list(units.configurations) if matched or measure.conflict is not None else []
     states: States = next(filter(None, (states_needed(units.configurations[name]) for name in fused)), "true")
 
-    lists = Transmission(log, units, group, complete=_needs_all_rows(units), states=states)
+    lists = Transmission(fuse_members(log, units, group), units, group, complete=_needs_all_rows(units), states=states)
     receivers, sightings = Receivers(lists, fused), list[Tracks]()
     judges = {name: Judge(log, units, name, receivers.issue_s(name), matches=matched) for name in fused}
     began_s = time.perf_counter()
@@ -217,5 +218,6 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
         arriving = lists.arriving(name).common_arrives_s
         way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (made.common_arrives_s, arriving)))
     until_s = np.fmin(np.fmin(listed_s, detections.captured_s), log.episodes.ended_s)
-    sight = measure_sight(log.sight_spans, units, None if of_truth else names, lists.group.listing, until_s)
+    sensing = None if of_truth else units.list_sensing(names)
+    sight = measure_sight(log.sight_spans, units, sensing, lists.group.listing, until_s)
     return DetectionEvents(received.units, detections, sight, way=way)

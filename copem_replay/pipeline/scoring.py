@@ -77,7 +77,12 @@ def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Track
 
 def _list_captures(output: ReceiverOutput) -> Float:
     """Captures, ascending: all that were received; in a time chunk those about the captures that entries name."""
-    captures: Float = np.unique(output.received.captured_s if output.stated is None else output.stated.stated_s)
+    received = output.received
+    captures: Float = np.unique(
+        np.append(received.captured_s, () if received.entry_age_s is None else received.entry_captured_s)
+        if output.stated is None
+        else output.stated.told[0]
+    )
     if output.whole:
         return captures
     after = np.searchsorted(captures, output.told.entries["captured_s"])

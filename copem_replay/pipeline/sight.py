@@ -133,7 +133,8 @@ def list_sight_spans(
 ) -> list[SightSpan]:
     """What the units `names` have of object m, while it is there between two instants; nothing of recorded units."""
     every = list(replay.expanded.units)
-    units = [every.index(name) for name in names if name in replay.expanded.modelled]
+    sensing = replay.expanded.list_sensing(names)
+    units = [every.index(name) for name in sensing if name in replay.expanded.modelled]
     time_s = sight.elapsed_ns * 1e-9
     frames = np.flatnonzero(
         (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
@@ -233,7 +234,7 @@ def _compute_part(
         return
     frame = part.start + world.frame_ix[rows]
     for u, (name, unit) in enumerate(experiment.units.items()):
-        if unit.recorded is not None:
+        if unit.pem is None:
             continue
         poses = _unit_poses(replay, name, unit, world)
         class_ix, unseen = scene.object_class[world.row_object_ix[rows]], np.full(len(rows), np.nan)

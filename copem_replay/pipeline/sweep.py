@@ -218,7 +218,8 @@ def _set_configuration(
 def _set_units(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
     if kind == "rate_hz":
         return {
-            name: unit if unit.recorded else unit.model_copy(update={"rate_hz": value}) for name, unit in units.items()
+            name: unit if unit.pem is None else unit.model_copy(update={"rate_hz": value})
+            for name, unit in units.items()
         }
     if kind == "penetration_rate":
         return {

@@ -99,15 +99,15 @@ class WorldChunk:
         if states not in self._listed:
             scene, experiment, runs = self.scene, self.experiment, self.group.runs
             equipped = self.group.listing
-            modelled = [k for k, unit in enumerate(experiment.units.values()) if unit.recorded is None]
+            modelled = [k for k, unit in enumerate(experiment.units.values()) if unit.pem is not None]
             there = None if equipped.all() else equipped[:, modelled]
             seen = perceive(scene, self.observations, experiment, runs, states=states, equipped=there)
             if states != "expected" and (ghosts := self.ghosts) is not None:
                 drawn, true = make_ghost_draws(scene, ghosts, experiment, int(runs[0])), ghosts.observations.tracks
                 seen = append_tracks(seen, add_states(scene, true, ghosts.observations, experiment, drawn))
-            seen = remove_outages(scene, seen, experiment, runs)
-            seen = delay_until_ready(seen, experiment.ready, CounterRng(experiment.seed, scene.log), runs)
-            self._listed[states] = self.log.add_recorded(seen, self.recorded)
+            seen = remove_outages(scene, self.log.add_recorded(seen, self.recorded), experiment, runs)
+            rng = CounterRng(experiment.seed, scene.log)
+            self._listed[states] = delay_until_ready(seen, experiment.ready, rng, runs)
         return self._listed[states]
 
     def sent(self, states: States) -> Tracks:
@@ -132,13 +132,18 @@ class WorldChunk:
 
     @cached_property
     def words(self) -> Words:
-        """The word of the object or ghost of each row, up to those of recorded units."""
+        """The word of the object or ghost of each row, of those of recorded units a number."""
         words = object_words(self.scene.object_ids)[self.observations.tracks.row_object_ix]
-        return words if self.ghosts is None else np.concatenate([words, self.ghosts.words])
+        numbers = np.arange(0 if self.recorded is None else len(self.recorded.existence), dtype=np.uint64)
+        if self.recorded is not None and self.experiment.fusing:  # one object is one to a unit that fuses
+            of, fusing = self.recorded.tracks, self.experiment.fusing
+            is_known = np.isin(np.array(of.units), list(fusing))[of.row_unit_ix] & (of.row_object_ix >= 0)
+            numbers = np.where(is_known, object_words(self.scene.object_ids)[of.row_object_ix], numbers)
+        return np.concatenate([words, *([] if self.ghosts is None else [self.ghosts.words]), numbers])
 
     @cached_property
     def claims(self) -> ClaimedRows:
-        """What the modelled units claim of their rows; the same in all runs where no claim is drawn."""
+        """What the units claim of their rows; the same in all runs where no claim is drawn."""
         observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
         existence, class_ix = observations.existence, observations.view.class_ix
         claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
@@ -149,6 +154,9 @@ class WorldChunk:
             drawn = make_ghost_draws(self.scene, ghosts, experiment, int(self.group.runs[0]))
             of_ghosts = draw_claims(ghosts.observations, experiment, drawn, ghosts.sort)
             claims = claims.followed_by(of_ghosts)
+        if (recorded := self.recorded) is not None:
+            given = EntryClaims(recorded.existence, recorded.class_probability, recorded.track_id)
+            claims = claims.followed_by(given)
         # A unit with track ids takes entries of one id for one object.
         same = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), self.words)
         return ClaimedRows(claims, same)
@@ -208,7 +216,10 @@ class Transmission:
         """The rows of objects that are sent, of those that are listed."""
         if self._sending is None:
             return sightings
-        return self._sending.of(sightings, object_words(self.log.scene.object_ids)[sightings.row_object_ix])
+        words = object_words(self.log.scene.object_ids)[sightings.row_object_ix]
+        if self._whole is not None and self.experiment.fusing:  # all rows of a log in one time chunk
+            words = self._whole.words
+        return self._sending.of(sightings, words)
 
     def arriving(self, name: str) -> Tracks:
         """The lists that the receiver of a configuration hears, by when links deliver them; those of others never are.
@@ -298,7 +309,7 @@ _VRU = class_indices(("vru",))
 
 
 class ClaimedRows(NamedTuple):
-    """What modelled units claim of rows (P,), ghosts last; `same`: equal where they see one object, no index."""
+    """What units claim of rows (P,), as `WorldChunk.listed` has them; `same`: equal where they see one object."""
 
     claims: EntryClaims
     same: Words
@@ -313,9 +324,8 @@ class SentObjects:
     keys: Words
 
     def of(self, seen: Tracks, words: Words) -> Tracks:
-        """The rows that are sent; `words`: the words of their objects, up to those of recorded units."""
-        left_out = self.partial[seen.row_unit_ix]
-        left_out[: len(words)] &= ~np.isin(_key_rows(seen.frame_ix[: len(words)], words), self.keys)
+        """The rows that are sent; `words`: those of their objects."""
+        left_out = self.partial[seen.row_unit_ix] & ~np.isin(_key_rows(seen.frame_ix, words), self.keys)
         arrives_s = np.where(self.lists, seen.common_arrives_s, np.inf)
         return replace(seen, valid=seen.valid & ~left_out & self.lists[seen.frame_ix], arrives_s=arrives_s[None])
 

@@ -343,7 +343,7 @@ def units_page(content: RecordingContent) -> rrb.Container:
 
     largest = max(content.configurations, key=lambda name: len(content.received(name)))
     units = content.received(largest)
-    placed = [name for name, unit in content.experiment.units.items() if unit.recorded is not None]
+    placed = [name for name, unit in content.experiment.units.items() if unit.pem is None]
     title = f"In colour: what {largest} lists. Grey: the truth. Pale ground: fields of view. Lines: listed it first"
     units = (*units, *(name for name in placed if name not in units))
     view = world_view(

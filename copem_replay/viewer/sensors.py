@@ -11,7 +11,7 @@ import pandas as pd
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import Bool, Float, Int, Tracks, UnitFaults
+from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks, UnitFaults
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import (
@@ -49,7 +49,7 @@ def write_units(out: RecordingSink, replay: Replay, experiment: Experiment) -> N
         path = ["world", "units", name]
         mark = rr.Radius.ui_points(MARK_POINTS)
         style = rr.Points3D.from_fields(colors=[EGO], radii=mark, labels=[name], show_labels=False)
-        if unit.recorded is not None:
+        if unit.pem is None:
             stamps = replay.truth.stamp_ns if unit.on is not None else replay.truth.stamp_ns[:1]
             place = _locate_recorded_unit(replay, experiment, unit, (stamps - replay.scene.t0_ns) * np.float64(1e-9))
             present = ~np.isnan(place[:, 0])
@@ -81,7 +81,7 @@ def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time
     """
     place = {}
     for name, unit in experiment.units.items():
-        if unit.recorded is not None:
+        if unit.pem is None:
             [at] = _locate_recorded_unit(replay, experiment, unit, np.array([time_s]))
             if not np.isnan(at[0]):
                 place[name] = at
@@ -133,7 +133,7 @@ def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
         if name not in experiment.units or not len(frames):
             continue
         unit = experiment.units[name]
-        if unit.recorded is not None:
+        if unit.pem is None:
             place[frames] = _locate_recorded_unit(replay, experiment, unit, lists.captured_s[frames])
             continue
         poses = replay.placed.poses[name]
@@ -143,8 +143,18 @@ def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
 
 
 def _locate_recorded_unit(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
-    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either."""
+    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either.
+
+    A unit that fuses is where its first member is.
+    """
     place = np.full((len(time_s), 3), np.nan)
+    while unit.fuses is not None:
+        name, unit = unit.fuses[0], experiment.units[unit.fuses[0]]
+        if unit.pem is not None:
+            poses, stamps = replay.placed.poses[name], replay.placed.stamps_ns[name] - replay.scene.t0_ns
+            row = np.maximum(np.searchsorted(stamps * 1e-9, time_s + SAME_INSTANT_S, side="right") - 1, 0)
+            place[:] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)[row]
+            return place
     if unit.at is not None:
         ground_m = unit_ground(replay.truth, "", unit)
         place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))

@@ -175,7 +175,7 @@ CAUSES = (
     Cause("loss", "radio", "lists lost", _lose_nothing),
     Cause("ticks", "fusion", "waiting for the next fused list", lambda e: _change_configuration(e, issue_hz=None)),
     Cause("fusion", "fusion", "fusion: association and its own confirmation",
-          lambda e: _change_configuration(e, fusion=IdealFusion())),
+          lambda e: _change_units(_change_configuration(e, fusion=IdealFusion()), fusion=None)),
     Cause("confirmation", "fusion", "confirmation by several lists", lambda e: _change_measure(e, confirm=Confirm())),
     Cause("pose", "unit", "errors of pose and clock", lambda e: _change_units(e, placed=None, clock=None)),
     Cause("ghosts", "fusion", "ghosts", lambda e: change_pems(e, lambda pem: pem.model_copy(update={"ghosts": ()}))),
@@ -218,11 +218,12 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
         raise ExperimentError(
             "measure.count_earlier: times may be negative then, which no cause explains; leave it out"
         )
-    units = {unit: experiment.units[unit] for unit in experiment.units_of(one)}
-    links = [one.link_of(unit) for unit in units]
+    own = experiment.units_of(one)
+    units = {unit: experiment.units[unit] for unit in (*own, *experiment.list_sensing(own))}
+    links = [one.link_of(unit) for unit in own]
     measure = experiment.measure
     if measure.distance_to not in ("ego", *units):  # distances are from somewhere, though no time depends on it
-        modelled = [unit for unit, its in units.items() if its.recorded is None]
+        modelled = [unit for unit, its in units.items() if its.pem is not None]
         if modelled:
             measure = measure.model_copy(update={"distance_to": modelled[0]})
         else:
@@ -337,7 +338,9 @@ class Counterfactuals:
         until_s[run, place] = rows["onset_s"] + after_s
         equipped = expanded.equipped(ready.scene.log, runs)
         there = np.ones((1, len(expanded.units)), dtype=bool) if equipped is None else equipped
-        found = measure_sight(ready.sight_spans, expanded, expanded.units_of(one), there, until_s)
+        found = measure_sight(
+            ready.sight_spans, expanded, expanded.list_sensing(expanded.units_of(one)), there, until_s
+        )
         seconds = {"range": found.out_of_view_s, "hidden": found.hidden_s}
         return {name: np.broadcast_to(of, until_s.shape)[run, place] for name, of in seconds.items()}
 

@@ -70,8 +70,8 @@ def _detect_first(
         turns, outdated_s = number_turns(received), np.minimum(first_newer_arrival_s(received), outdated_s)
         turn, instant, unit_of_turn = turns.turn, turns.list_instant, turns.unit_ix
     rows = _ListedRows(
-        received.valid, arrives_s[received.frame_ix], captured_s, outdated_s[received.frame_ix], received.row_unit_ix,
-        instant[received.frame_ix], turn[received.frame_ix],
+        received.valid, arrives_s[received.frame_ix], captured_s, received.entry_captured_s,
+        outdated_s[received.frame_ix], received.row_unit_ix, instant[received.frame_ix], turn[received.frame_ix],
     )  # fmt: skip
     stays = _EpisodeRows(order, bounds, not_before_s, episodes.ended_s + SAME_INSTANT_S)
     _find_first(rows, unit_of_turn, stays, confirm.hits, confirm.of, out)
@@ -106,6 +106,7 @@ class _ListedRows(NamedTuple):
     valid: Bool  # (S, P)
     arrives_s: Float
     captured_s: Float
+    entry_s: Float  # captures of the rows themselves
     outdated_s: Float
     unit_ix: Int
     instant: Int  # of its list's turn
@@ -124,7 +125,7 @@ class _EpisodeRows(NamedTuple):
 def _find_first(
     rows: _ListedRows, unit_of_turn: Int, stays: _EpisodeRows, hits: int, of: int, out: FirstDetections
 ) -> None:
-    valid, arrives_s, captured_s, outdated_s, unit_ix, instant, turn = rows
+    valid, arrives_s, captured_s, entry_s, outdated_s, unit_ix, instant, turn = rows
     order, bounds, not_before_s, until_s = stays
     detection_s, newest_s, first_unit_ix = out
     held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
@@ -140,7 +141,7 @@ def _find_first(
                 p = order[k]
                 if arrives_s[p] > until_s[m]:
                     break
-                if not valid[s, p] or captured_s[p] < not_before_s[m]:
+                if not valid[s, p] or entry_s[p] < not_before_s[m]:
                     continue
                 held[n] = p
                 n += 1

@@ -1,0 +1,96 @@
+"""Chains: units that fuse the lists of others. A coPEM has the interface of a PEM (Piazzoni et al. 2022).
+
+What such a unit lists is what a receiver of its members lists: each is a configuration of its members (`receiver.py`),
+whose fused lists travel on as those of a recorded unit do, made anew in each run. An entry holds the object that it is
+about by its members' lists, so *known means listed* holds along the chain; it is as old as the newest of these that
+contributed. A list is captured when the newest of its members' lists was, and 2 µs after the unit's list before where
+that has the same capture: no two lists of a unit are of one instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, SAME_INSTANT_NS, STATES, Int, Scene, Tracks, join_tracks
+from copem_replay.experiment.schema import Experiment
+from copem_replay.io.recorded_units import RecordedUnits
+from copem_replay.perception.perceive import displace_rows
+from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, expand_members
+from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.receiver import Receivers
+from copem_replay.pipeline.scoring import match_lists
+from copem_replay.pipeline.world import Transmission
+
+
+def fuse_members(log: Replay, experiment: Experiment, group: RunGroup) -> Replay:
+    """The log in the one run of a group, in which the lists of the units that fuse are recorded ones."""
+    units = log.expand(experiment)
+    if not units.fusing:
+        return log
+    inner = expand_members(units)
+    kept = np.array([unit.fuses is None for unit in units.units.values()])
+    members = RunGroup(group.runs, group.listing[:, kept], group.sending[kept])
+    receivers = Receivers(Transmission(log.with_units(inner), inner, members))
+    [world] = receivers.worlds()
+    fused = [] if log.recorded is None else [log.recorded]
+    for name in inner.configurations:
+        output = receivers.fuse(world, name)
+        matches = match_lists(log.truth_cache, output, units.measure) if output.fused_tracks is None else None
+        [(_, fused_tracks)] = output.tracks_by_run(matches)
+        fused.append(_list_fused(name, fused_tracks, log.scene))
+    joined = RecordedUnits(
+        join_tracks(tuple(name for one in fused for name in one.tracks.units), [one.tracks for one in fused]),
+        *(np.concatenate(columns) for columns in zip(*((one.existence, one.class_probability, one.track_id)
+          for one in fused), strict=True)),
+    )  # fmt: skip
+    moved = _add_pose_errors(log, joined.tracks, units, group.runs)
+    return log.with_recorded(replace(joined, tracks=moved))
+
+
+def _add_pose_errors(log: Replay, lists: Tracks, units: ExpandedExperiment, runs: Int) -> Tracks:
+    """The lists of units that fuse, moved by their errors about their own poses: about the place of the first member."""
+    for name, unit in units.fusing.items():
+        if unit.placed is None or unit.fuses is None:
+            continue
+        poses, stamps_ns = log.placed.poses[unit.fuses[0]], log.placed.stamps_ns[unit.fuses[0]]
+        rows = np.flatnonzero(lists.row_unit_ix == lists.units.index(name))
+        nearest = np.searchsorted(stamps_ns, lists.stamp_ns[lists.frame_ix[rows]], side="right") - 1
+        at_m = np.stack([poses.x_m[nearest], poses.y_m[nearest]])
+        away_m = np.stack([lists.x_m[0, rows], lists.y_m[0, rows]]) - at_m
+        lists = displace_rows(log.scene, lists, rows, at_m, away_m, unit.placed, (units.seed, name, runs))
+    return lists
+
+
+def _list_fused(name: str, tracks: FusedTracks, scene: Scene) -> RecordedUnits:
+    """The fused lists of one run as the lists of a unit, with the object that each entry holds."""
+    fused, said = tracks.fused, tracks.said
+    rows = fused.by_frame[0][fused.valid[0, fused.by_frame[0]]]
+    object_ix = fused.row_object_ix[rows]
+    if tracks.second_of is not None:
+        object_ix = np.where(object_ix < 0, tracks.second_of[rows], object_ix)
+    stamp_ns = _keep_apart(np.where(fused.stamp_ns == NO_CAPTURE_NS, scene.t0_ns, fused.stamp_ns))
+    captured_s = (stamp_ns - scene.t0_ns) * np.float64(1e-9)
+    states: dict[str, Any] = {name: None if (of := getattr(fused, name)) is None else of[:, rows] for name in STATES}
+    states["entry_age_s"] = (captured_s[fused.frame_ix[rows]] - tracks.captured_s[0, rows])[None]
+    listed = replace(
+        fused, units=(name,), start=np.arange(len(rows) + 1), unit_ix=np.zeros(len(rows), dtype=np.int64),
+        object_ix=object_ix, frame_ix=fused.frame_ix[rows], stamp_ns=stamp_ns, captured_s=captured_s,
+        valid=np.ones((1, len(rows)), dtype=bool), **states,
+    )  # fmt: skip
+    if said is not None:
+        return RecordedUnits(
+            listed, *(np.array(said[what][rows]) for what in ("existence", "class_probability", "track_id"))
+        )
+    certain = np.eye(len(CLASSES))[scene.object_class[object_ix]]
+    return RecordedUnits(listed, np.ones(len(rows)), certain, np.full(len(rows), -1))
+
+
+def _keep_apart(stamp_ns: Int) -> Int:
+    """Captures (K,) of a unit's lists in their order, none within an instant of the one before."""
+    step_ns = 2 * SAME_INSTANT_NS * np.arange(len(stamp_ns))
+    apart: Int = np.maximum.accumulate(stamp_ns - step_ns) + step_ns
+    return apart
