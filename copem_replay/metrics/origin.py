@@ -157,9 +157,9 @@ def _holds(h: Holdings, s: int, a: int, o: int, not_before_s: float) -> bool:
     for q in range(first + count_below(h.row_captured_s[first:after], h.captured_s[a]), after):
         if h.row_captured_s[q] > h.captured_s[a]:
             break
-        if h.row_frame[q] == h.frame[a] and h.valid[s if len(h.valid) > 1 else 0, h.row[q]]:
-            if h.row_entry_s[q] >= not_before_s:
-                return True
+        listed = h.row_frame[q] == h.frame[a] and h.valid[s if len(h.valid) > 1 else 0, h.row[q]]
+        if listed and h.row_entry_s[q] >= not_before_s:
+            return True
     return False
 
 

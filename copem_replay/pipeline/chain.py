@@ -52,7 +52,7 @@ def fuse_members(log: Replay, experiment: Experiment, group: RunGroup) -> Replay
 
 
 def _add_pose_errors(log: Replay, lists: Tracks, units: ExpandedExperiment, runs: Int) -> Tracks:
-    """The lists of units that fuse, moved by their errors about their own poses: about the place of the first member."""
+    """The lists, those of units that fuse moved by the errors of their poses, about the place of the first member."""
     for name, unit in units.fusing.items():
         if unit.placed is None or unit.fuses is None:
             continue

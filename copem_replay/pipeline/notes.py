@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeGuard
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.experiment.drive import resolve_for_log, settings_notes
 from copem_replay.experiment.schema import Experiment, output_unit
 from copem_replay.fusion.interface import IdealFusion
+from copem_replay.fusion.tracker import Tracker
 from copem_replay.io.findings import as_finding
 from copem_replay.io.recording import KnownLog, Recording
 from copem_replay.metrics.detection.conflict import describe_excluded
@@ -279,17 +280,31 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
 
 
 def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:
-    """Configurations whose fusion knows the true captures and ids although a clock is off, or a unit has ghosts."""
+    """Configurations whose fusion ignores what units get wrong, or takes errors that hang together as independent.
+
+    Ideal fusion knows the true captures and ids although a clock is off, or a unit has ghosts.
+    """
     for name, configuration in experiment.configurations.items():
-        if not isinstance(configuration.fusion, IdealFusion):
+        fusion, own = configuration.fusion, experiment.units_of(configuration)
+        for unit in own:
+            if _is_tracker(experiment.units[unit].fusion) and _is_tracker(fusion) and not fusion.common_share:
+                yield (
+                    f"configuration {name}: the errors of {unit}'s lists, which a tracker makes, hang together; its "
+                    "own tracker takes them as independent (`common_share` says what is common)"
+                )
+        if not isinstance(fusion, IdealFusion):
             continue
-        units = {unit: experiment.units[unit] for unit in experiment.units_of(configuration)}
+        units = {unit: experiment.units[unit] for unit in (*own, *experiment.list_sensing(own))}
         off = [unit for unit, made in units.items() if made.clock is not None]
         if off:
             yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
         ghostly = [unit for unit, made in units.items() if made.pem is not None and experiment.pems[made.pem].ghosts]
         if ghostly:
             yield f"configuration {name}: ideal fusion uses truth ids, ignoring ghosts of {', '.join(ghostly)}"
+
+
+def _is_tracker(fusion: object) -> TypeGuard[Tracker]:
+    return isinstance(fusion, Tracker)
 
 
 _LOST = 0.001

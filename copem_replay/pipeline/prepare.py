@@ -236,11 +236,11 @@ class Replay:
         return self.truth if keep.all() else self.truth.take_rows(np.flatnonzero(keep), states=False)
 
     def with_units(self, expanded: ExpandedExperiment) -> Replay:
-        """This log for an experiment that lacks units which fuse."""
+        """The log for an experiment that lacks units which fuse."""
         return self._keep_observed(replace(self, expanded=expanded))
 
     def with_recorded(self, recorded: RecordedUnits) -> Replay:
-        """This log with other recorded lists, as those of one run."""
+        """The log with other recorded lists, as those of one run."""
         paths_of = None if self.paths_of is None else self.paths_of.with_recorded(recorded)
         return self._keep_observed(replace(self, recorded=recorded, paths_of=paths_of))
 

@@ -121,7 +121,8 @@ def compute_status(
     heard_of = (
         [TRUTH] if of_truth else [name for name in experiment.units_of(asked_configuration) if name in received.units]
     )
-    modelled = [numbers[name] for name in heard_of if name in experiment.modelled]
+    sensing = [] if of_truth else experiment.list_sensing(heard_of)
+    modelled = [numbers[name] for name in sensing if name in experiment.modelled]
     listed = [
         [_find_object_lists(received, received.units.index(name), k) for name in heard_of] for k in sight.object_ix
     ]

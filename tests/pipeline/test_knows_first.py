@@ -150,7 +150,15 @@ def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool) -> 
     lost = {"kind": "constant", "probability": float(rng.choice([0.5, 0.8, 1.0]))}
     link = {"latency": gamma, "order": str(rng.choice(["kept", "free"])), "reception": lost}
     link |= {"channel": {"kbps": float(rng.choice([20, 200]))}} if rng.random() < 0.3 else {}
-    common = {"units": list(units)} | draw_receiver(rng)
+    if len(pems) > 1 and rng.random() < 0.5:  # two of them are sensors of one mast
+        fusion = {"kind": str(rng.choice(["ideal", "gnn", "union", "tracker"]))}
+        for name in ("u0", "u1"):
+            units[name] = {key: value for key, value in units[name].items() if key not in ("sends", "clock")}
+        mast = draw_unit(rng, "", sends=True)
+        own = {key: value for key, value in mast.items() if key not in ("at", "height_m", "pem")}
+        units["mast"] = own | {"fuses": ["u0", "u1"], "fusion": fusion}
+    heard = [name for name in units if "mast" not in units or name not in ("u0", "u1")]
+    common = {"units": heard} | draw_receiver(rng)
     tracker = {"kind": "tracker", "late": str(rng.choice(["stale", "predict", "replay"]))}
     configurations = {"ideal": common} | {
         n: common | {"fusion": f} for n, f in (FUSIONS | {"tracker": tracker}).items()

@@ -127,8 +127,8 @@ def _format_value(value: Any) -> str:
 def describe_unit_errors(experiment: Experiment) -> str:
     """A sentence per unit with such errors, each after a blank; empty without any."""
     sentences = ""
-    for name, unit in experiment.modelled.items():
-        errors = [*_describe_unit(unit), *_describe_pem(experiment.pems[str(unit.pem)])]
+    for name, unit in experiment.units.items():
+        errors = [*_describe_unit(unit), *(_describe_pem(experiment.pems[unit.pem]) if unit.pem is not None else [])]
         if errors:
             sentences += f" Unit {name}: {', '.join(errors)}."
     return sentences
@@ -136,6 +136,9 @@ def describe_unit_errors(experiment: Experiment) -> str:
 
 def _describe_unit(unit: Unit) -> list[str]:
     errors = []
+    if unit.fuses is not None:
+        kind = "ideal" if unit.fusion is None else unit.fusion.kind
+        errors.append(f"lists what {kind} fusion makes of the lists of {' and '.join(unit.fuses)}")
     if unit.outages is not None:
         errors.append(
             f"no lists {100 * unit.outages.down_share:g} % of the time, {unit.outages.lasts_s:g} s at a time on average"
