@@ -140,7 +140,7 @@ def draw_receiver(rng: np.random.Generator) -> dict[str, Any]:
     return receiver
 
 
-def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool) -> Experiment:
+def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool, hub: bool = True) -> Experiment:
     hits, of = [(1, 1), (1, 1), (2, 2), (2, 3), (3, 5)][rng.integers(5)]
     pems = {f"p{k}": draw_pem(rng) for k in range(rng.integers(1, 4))}
     units = {f"u{k}": draw_unit(rng, f"p{k}", sends=True) for k in range(len(pems))}
@@ -150,7 +150,7 @@ def draw_experiment(path: Path, rng: np.random.Generator, *, recorded: bool) -> 
     lost = {"kind": "constant", "probability": float(rng.choice([0.5, 0.8, 1.0]))}
     link = {"latency": gamma, "order": str(rng.choice(["kept", "free"])), "reception": lost}
     link |= {"channel": {"kbps": float(rng.choice([20, 200]))}} if rng.random() < 0.3 else {}
-    if len(pems) > 1 and rng.random() < 0.5:  # two of them are sensors of one mast
+    if hub and len(pems) > 1 and rng.random() < 0.5:  # two of them are sensors of one mast
         fusion = {"kind": str(rng.choice(["ideal", "gnn", "union", "tracker"]))}
         for name in ("u0", "u1"):
             units[name] = {key: value for key, value in units[name].items() if key not in ("sends", "clock")}
@@ -236,7 +236,7 @@ def test_who_is_always_listed_is_confirmed_at_the_list_at_which_the_ideal_confir
         for k in range(41)
     ]
     path = write_recording(tmp_path_factory.mktemp("drawn") / "scene.mcap", frames, host=1)
-    plan = draw_experiment(path, rng, recorded=False).model_dump(mode="json", exclude_unset=True)
+    plan = draw_experiment(path, rng, recorded=False, hub=False).model_dump(mode="json", exclude_unset=True)
     hits, of = [(2, 2), (2, 3), (3, 5)][rng.integers(3)]
     couple = {
         "detection": {"kind": "constant", "probability": 1.0},
