@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from copem_replay.communication.arrivals import FusionSchedule
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, NO_CAPTURE_NS, SAME_INSTANT_NS, STATES, Int, Scene, Tracks, join_tracks
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, STATES, VALUES, Int, Scene, Tracks, join_tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recorded_units import RecordedUnits
 from copem_replay.perception.perceive import displace_rows
@@ -26,22 +27,30 @@ from copem_replay.pipeline.scoring import match_lists
 from copem_replay.pipeline.world import Transmission
 
 
-def fuse_members(log: Replay, experiment: Experiment, group: RunGroup) -> Replay:
-    """The log in the one run of a group, in which the lists of the units that fuse are recorded ones."""
+def fuse_members(log: Replay, experiment: Experiment, group: RunGroup, *, entries: bool = True) -> Replay:
+    """The log in the one run of a group, in which the lists of the units that fuse are recorded ones.
+
+    `entries=False`: when there are lists is enough; nothing is fused.
+    """
     units = log.expand(experiment)
     if not units.fusing:
         return log
     inner = expand_members(units)
     kept = np.array([unit.fuses is None for unit in units.units.values()])
     members = RunGroup(group.runs, group.listing[:, kept], group.sending[kept])
-    receivers = Receivers(Transmission(log.with_units(inner), inner, members))
-    [world] = receivers.worlds()
-    fused = [] if log.recorded is None else [log.recorded]
+    sent = Transmission(log.with_units(inner), inner, members)
+    receivers, fused = Receivers(sent), [] if log.recorded is None else [log.recorded]
+    worlds = list(receivers.worlds()) if entries else []
     for name in inner.configurations:
-        output = receivers.fuse(world, name)
-        matches = match_lists(log.truth_cache, output, units.measure) if output.fused_tracks is None else None
-        [(_, fused_tracks)] = output.tracks_by_run(matches)
-        fused.append(_list_fused(name, fused_tracks, log.scene))
+        lists = _find_lists(name, receivers.schedule(name), sent.lists.stamp_ns, log.scene)
+        if not worlds:
+            none = np.empty(0)
+            fused.append(RecordedUnits(lists, none, np.empty((0, len(CLASSES))), none.astype(np.int64)))
+        for world in worlds:
+            output = receivers.fuse(world, name)
+            matches = match_lists(log.truth_cache, output, units.measure) if output.fused_tracks is None else None
+            [(_, fused_tracks)] = output.tracks_by_run(matches)
+            fused.append(_list_fused(lists, fused_tracks, log.scene))
     joined = RecordedUnits(
         join_tracks(tuple(name for one in fused for name in one.tracks.units), [one.tracks for one in fused]),
         *(np.concatenate(columns) for columns in zip(*((one.existence, one.class_probability, one.track_id)
@@ -65,21 +74,30 @@ def _add_pose_errors(log: Replay, lists: Tracks, units: ExpandedExperiment, runs
     return lists
 
 
-def _list_fused(name: str, tracks: FusedTracks, scene: Scene) -> RecordedUnits:
+def _find_lists(name: str, schedule: FusionSchedule, stamp_ns: Int, scene: Scene) -> Tracks:
+    """The lists (K,) of a unit that fuses, without entries; `stamp_ns (F,)`: captures of its members' lists."""
+    newest_ns = np.where(schedule.newest >= 0, stamp_ns[schedule.newest], scene.t0_ns).max(axis=1, initial=scene.t0_ns)
+    captures_ns, none, no_rows = _keep_apart(newest_ns), np.empty(0, dtype=np.int64), np.empty((1, 0))
+    return Tracks(
+        units=(name,), start=np.zeros(1, dtype=np.int64), unit_ix=none, object_ix=none, frame_ix=none,
+        stamp_ns=captures_ns, captured_s=(captures_ns - scene.t0_ns) * np.float64(1e-9),
+        frame_unit_ix=np.zeros(len(captures_ns), dtype=np.int64), arrives_s=schedule.issue_s[None],
+        valid=no_rows.astype(bool), **dict.fromkeys(VALUES, no_rows),
+    )  # fmt: skip
+
+
+def _list_fused(lists: Tracks, tracks: FusedTracks, scene: Scene) -> RecordedUnits:
     """The fused lists of one run as the lists of a unit, with the object that each entry holds."""
     fused, said = tracks.fused, tracks.said
     rows = fused.by_frame[0][fused.valid[0, fused.by_frame[0]]]
     object_ix = fused.row_object_ix[rows]
     if tracks.second_of is not None:
         object_ix = np.where(object_ix < 0, tracks.second_of[rows], object_ix)
-    stamp_ns = _keep_apart(np.where(fused.stamp_ns == NO_CAPTURE_NS, scene.t0_ns, fused.stamp_ns))
-    captured_s = (stamp_ns - scene.t0_ns) * np.float64(1e-9)
     states: dict[str, Any] = {name: None if (of := getattr(fused, name)) is None else of[:, rows] for name in STATES}
-    states["entry_age_s"] = (captured_s[fused.frame_ix[rows]] - tracks.captured_s[0, rows])[None]
+    states["entry_age_s"] = (lists.captured_s[fused.frame_ix[rows]] - tracks.captured_s[0, rows])[None]
     listed = replace(
-        fused, units=(name,), start=np.arange(len(rows) + 1), unit_ix=np.zeros(len(rows), dtype=np.int64),
-        object_ix=object_ix, frame_ix=fused.frame_ix[rows], stamp_ns=stamp_ns, captured_s=captured_s,
-        valid=np.ones((1, len(rows)), dtype=bool), **states,
+        lists, start=np.arange(len(rows) + 1), unit_ix=np.zeros(len(rows), dtype=np.int64), object_ix=object_ix,
+        frame_ix=fused.frame_ix[rows], valid=np.ones((1, len(rows)), dtype=bool), **states,
     )  # fmt: skip
     if said is not None:
         return RecordedUnits(

@@ -53,7 +53,7 @@ from copem_replay.perception.sensor_poses import UnitPoses
 from copem_replay.pipeline.chain import fuse_members
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, find_facts
 from copem_replay.pipeline.sweep import describe_unswept
-from copem_replay.pipeline.world import Transmission, asks_for_path
+from copem_replay.pipeline.world import Transmission, asks_for_path, has_channel
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.prepare import Replay
@@ -92,7 +92,8 @@ def measure_list_rates(replay: Replay, experiment: Experiment) -> dict[str, List
     units, rates = replay.expand(experiment), dict[str, list[ListRate]]()
     for run in range(experiment.runs if units.arrivals_differ else 1):
         group = RunGroup.of_all_units(units, np.array([run]))
-        lists = Transmission(fuse_members(replay, units, group), units, group)
+        entries = bool(units.sends) or has_channel(units)  # what is sent when depends on what is listed
+        lists = Transmission(fuse_members(replay, units, group, entries=entries), units, group)
         for name in units.configurations:
             rates.setdefault(name, []).append(_measure_rate(lists, name))
     return {name: join_list_rates(runs) for name, runs in rates.items()}

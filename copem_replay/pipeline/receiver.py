@@ -370,6 +370,10 @@ class Receivers:
             self._last_fused = None  # of the chunk before, which is dropped
             yield lists.world(chunk, chunk.from_s if reach is None else reach.earliest_s(chunk))
 
+    def schedule(self, name: str) -> FusionSchedule:
+        """All instants of a configuration's receiver, and the lists that it then has."""
+        return self._schedules[name]
+
     def issue_s(self, name: str) -> Float:
         """(K,) all instants of a configuration's receiver."""
         return self._schedules[name].issue_s
