@@ -341,7 +341,7 @@ def _find_best_receptions(
     elif asks_for_path(units, replay.scene):
         best = _ask_best_reception(reception, replay.paths, where)
         for sender in senders:
-            lists = replay.senders == sender
+            lists = replay.senders == next(iter(units.list_sensing([sender])))  # a hub is where its first member is
             if lists.any():
                 yield named.get(sender, sender), float(best[lists].max())
 

@@ -283,7 +283,8 @@ def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
                     f"{where}: the distance to a receiver is unknown, for the log has no ego; use constant"
                 )
             units = experiment.units_of(configuration) if unit_links.units is None else unit_links.units
-            far = [TRUTH] if configuration.units == TRUTH else sorted(experiment.recorded.keys() & set(units))
+            sensing = () if configuration.units == TRUTH else experiment.list_sensing(units)
+            far = [TRUTH] if configuration.units == TRUTH else sorted(experiment.recorded.keys() & set(sensing))
             if far:
                 source = "of the truth" if far == [TRUTH] else f"of unit {far[0]}, whose lists are recorded,"
                 raise ExperimentError(f"{where}: the distance {source} to a receiver is not known; use constant")
