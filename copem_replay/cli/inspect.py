@@ -113,6 +113,7 @@ def check(
     ego: Ego = None,
     from_s: FromS = None,
     to_s: ToS = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Print every note.")] = False,
 ) -> int:
     """Report every problem of an experiment, with file and line.
 
@@ -130,7 +131,7 @@ def check(
     replays, warnings = prepare_study(study)
     counted = [count_counted(one.episodes.count_began(), study.experiment.measure.began) for one in replays]
     undecided = note_undecidable(study.experiment.criteria, counted, study.experiment.measure)
-    print_first_notes(list_notes(study.recordings, replays, study.experiment, replayed=False))
+    print_first_notes(list_notes(study.recordings, replays, study.experiment, replayed=False), explain=explain)
     print_notes([*warnings, *undecided])
     for line in list_began(replays, study.experiment):
         print_line(line)

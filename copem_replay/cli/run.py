@@ -118,7 +118,7 @@ def run(
         study = _read_study(place, experiment, source, skip_unreadable, cache, cluster)
         url = _check_viewer(study.experiment, viewer) if live or viewer is not None else None
         tables, advice = _replay_study(study, jobs, cache, threads=cluster is None)
-        results = _write_results(place, study, tables, advice, cache, url, label)
+        results = _write_results(place, study, tables, advice, cache, url, label, explain=explain)
         decision = decide(results)
         _print_results(tables, results, decision, explain=explain)
         if by is not None and tables.summary_by is not None:
@@ -210,7 +210,7 @@ def _replay_study(
 
 def _write_results(
     place: ResultsPlace, study: LoadedStudy, tables: StudyTables, advice: list[str], cache: PartCache | None,
-    viewer: str | None, label: str | None,
+    viewer: str | None, label: str | None, *, explain: bool,
 ) -> Results:  # fmt: skip
     """Fill the results folder, then print notes and problems. Returns the results."""
     from copem_replay.api.run import list_exporters
@@ -223,7 +223,7 @@ def _write_results(
         print_problems([f"pieces: {cache.computed} computed, {cache.found} found in {cache.store.where}"])
     skipped = [f"{path}: skipped: {reason}" for path, reason in study.skipped]
     print_notes([*place.notes, *skipped])
-    print_first_notes(notes)
+    print_first_notes(notes, explain=explain)
     print_notes([*tables.costs, *advice])
     print_problems(place.failed)
     return Results(place.shown)

@@ -156,15 +156,15 @@ def print_notes(lines: Iterable[str]) -> None:
 
 
 MOST_NOTES = 4
-"""More lines are not read: the rest is in `info` and in the results."""
+"""More lines are not read."""
 
 
-def print_first_notes(lines: Sequence[str]) -> None:
-    """Print the first notes on stderr, and where the others are."""
-    print_notes(lines[:MOST_NOTES])
-    if len(lines) > MOST_NOTES:
-        more = len(lines) - MOST_NOTES
-        print_problems([f"and {count_noun(more, 'more note')}: `copem-replay info LOG`, and read.csv of the results"])
+def print_first_notes(lines: Sequence[str], *, explain: bool) -> None:
+    """Print the first notes on stderr, and how many others there are; all of them with `explain`."""
+    most = len(lines) if explain else MOST_NOTES
+    print_notes(lines[:most])
+    if len(lines) > most:
+        print_problems([f"and {count_noun(len(lines) - most, 'more note')}: --explain"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

@@ -269,7 +269,6 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
     for name, unit in experiment.units.items():
         if isinstance(unit.on, Carriers) and name not in replay.expanded.named:
             yield f"unit {name}: the log has no object to carry it ({', '.join(unit.on.classes)})"
-    yield from _find_ignored_errors(experiment)
     yield from _find_dead_links(replay, experiment)
     yield from _find_missing_hosts(replay, experiment)
     end_s = replay.scene.end_s
@@ -278,6 +277,7 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
         late = [unit for unit in units if (experiment.delay_of(name, unit) or 0.0) > end_s]
         if late:
             yield f"configuration {name}: the latency of {', '.join(late)} is longer than the log"
+    yield from _find_ignored_errors(experiment)
 
 
 def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:

@@ -16,7 +16,14 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.cli import main as cli
-from copem_replay.cli.terminal import ProgressLines, format_duration, print_table, show_progress
+from copem_replay.cli.terminal import (
+    MOST_NOTES,
+    ProgressLines,
+    format_duration,
+    print_first_notes,
+    print_table,
+    show_progress,
+)
 from copem_replay.core.compiled import compiling
 from copem_replay.core.errors import wrap_line
 from copem_replay.metrics.summary import format_summary, format_table
@@ -286,3 +293,12 @@ class TestProgress:
     )
     def test_durations(self, time_s: float, said: str) -> None:
         assert format_duration(time_s) == said
+
+
+def test_notes_beyond_the_first_are_counted_and_explain_prints_them(capsys: pytest.CaptureFixture[str]) -> None:
+    notes = [f"note {k}" for k in range(MOST_NOTES + 3)]
+    print_first_notes(notes, explain=False)
+    first = capsys.readouterr().err.splitlines()
+    assert first == [f"note: {one}" for one in notes[:MOST_NOTES]] + ["and 3 more notes: --explain"]
+    print_first_notes(notes, explain=True)
+    assert capsys.readouterr().err.splitlines() == [f"note: {one}" for one in notes]
