@@ -27,7 +27,7 @@ def test_notebook_prints_what_it_shows(path: Path) -> None:
 
 def test_there_are_notebooks() -> None:
     names = ["01_the_paper", "02_your_own_fusion", "03_reading_the_results", "04_a_pem_from_recordings"]
-    assert [path.stem for path in NOTEBOOKS] == names
+    assert [path.stem for path in NOTEBOOKS] == [*names, "05_your_own_drive"]
 
 
 def test_a_text_that_comes_in_pieces_is_one_text() -> None:
