@@ -13,6 +13,7 @@ from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
@@ -34,7 +35,6 @@ from copem_replay.viewer.sink import (
     object_lanes_path,
     short_ids,
     show_seconds,
-    to_nanoseconds,
 )
 
 if TYPE_CHECKING:

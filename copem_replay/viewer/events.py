@@ -19,6 +19,7 @@ from copem_replay.metrics.survival import EndReason
 from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.viewer.sink import (
     DIFFERENCE_SHORT,
     DIFFERENCE_TEXT,
@@ -32,7 +33,6 @@ from copem_replay.viewer.sink import (
     show_seconds,
     stack_float32,
     table_rows,
-    to_nanoseconds,
 )
 
 # Text panels: events, differences, summary, legend.

@@ -23,18 +23,15 @@ import pyarrow as pa
 from copem_replay.communication.arrivals import find_overtaken_lists
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Scene
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.sight import Sight, Span, name_bodies, smooth_status
+from copem_replay.pipeline.sight import ABSENT, STEADY_S, Sight, SpanNames, list_spans, name_bodies, smooth_status
+from copem_replay.pipeline.status import KNOWN, UNDER_WAY, UNMATCHED, EpisodeClocks, Status, to_nanoseconds
+from copem_replay.pipeline.status import LOST as LIST_LOST
 from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
-    ABSENT,
-    CAPTURED,
-    HIDDEN,
-    KNOWN,
     ONSET,
     STATUS,
-    UNMATCHED,
     RecordingSink,
     configuration_part,
     lane_path,
@@ -43,10 +40,8 @@ from copem_replay.viewer.sink import (
     short_ids,
     show_seconds,
     status_colour,
-    to_nanoseconds,
 )
-from copem_replay.viewer.sink import LOST as LIST_LOST
-from copem_replay.viewer.status import EpisodeClocks, Status, lane_text
+from copem_replay.viewer.status import lane_text
 
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
@@ -72,21 +67,27 @@ def write_lanes(
     """
     import rerun as rr
 
-    bodies, units = name_bodies(scene, sight.solids, short_ids(scene)), [*experiment.units, TRUTH]
+    names = SpanNames([*experiment.units], name_bodies(scene, sight.solids, short_ids(scene)))
     for m, k in enumerate(sight.object_ix.tolist()):
         axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
-            spans = smooth_status(status.elapsed_ns, status.status[:, m], kept=KNOWN)
-            texts = [_span_text(bodies, units, sight, status, m, span) for span in spans]
-            begins = status.elapsed_ns[[span.first for span in spans]]
-            tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
+            cut, end_ns = np.searchsorted(status.elapsed_ns, clock_ns[0]), status.elapsed_ns[-1] + STEADY_S * 1e9
+            told = status.elapsed_ns, status.status[:, m], status.unit_ix[:, m], status.frame
+            spans = [  # the onset is a border: before it words do not tell why an object is unknown
+                span
+                for rows, until_ns in ((slice(cut), min(clock_ns[0], end_ns)), (slice(cut, None), end_ns))
+                for span in list_spans(sight, m, tuple(of[rows] for of in told), names, until_ns * 1e-9, kept=KNOWN)
+            ]
+            texts = [None if span.status == ABSENT else lane_text(span) for span in spans]
+            begins = to_nanoseconds([span.begin_s for span in spans])
+            tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             elapsed, values, styles = _tell_lane(begins, texts, tints, name, clock_ns, axis_ns)
             path = lane_path(scene, k, place, name)
-            told = [value for value in values if value is not None]  # the row is empty while the object is absent
-            states = rr.StateChange.columns(state=pa.array(told, pa.string()))
+            there = [value for value in values if value is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(there, pa.string()))
             out.columns(path, elapsed, states.partition(np.array([v is not None for v in values], dtype=np.int64)))
             labels, drawn = zip(*styles.values(), strict=True)
             out.static(path, rr.StateConfiguration(values=list(styles), labels=list(labels), colors=list(drawn)))
@@ -198,21 +199,6 @@ def _shorten_words(text: str) -> Iterator[str]:
         yield flag[0].rstrip()
 
 
-def _span_text(
-    bodies: Sequence[str], units: Sequence[str], sight: Sight, status: Status, m: int, span: Span
-) -> str | None:
-    """The text of a span, with its most frequent unit and hiding body; None while the object is absent."""
-    if span.status == ABSENT:
-        return None
-    rows = np.arange(span.first, span.end)
-    rows = rows[status.status[rows, m] == span.status]
-    unit_ix = status.unit_ix[rows, m]
-    if span.status == HIDDEN:
-        by, body = sight.find_hider(unit_ix, status.frame[rows], m)
-        return lane_text(HIDDEN, units[by], bodies[body])
-    return lane_text(span.status, units[int(np.bincount(unit_ix + 1).argmax()) - 1], "")
-
-
 def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
     """Say how long after the onset the object is first known, where that begins: “0.60 s known”.
 
@@ -271,7 +257,7 @@ def _insert_onset(
 
 FATES = ("in time", "lost", "late", "overtaken")
 IN_TIME, LOST, LATE, OVERTAKEN = range(len(FATES))
-COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[CAPTURED], OVERTAKEN: STATUS[UNMATCHED]}
+COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[UNDER_WAY], OVERTAKEN: STATUS[UNMATCHED]}
 """Colours in lanes, as in an object's lane: lost, captured (under way) and unmatched."""
 QUIET_S, TOLD_S = 1.0, 5.0
 """Lists of one fate share a row of the events if they are no more than the first apart, up to the second after the

@@ -26,6 +26,7 @@ from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import Sight, compute_sight, find_looked_at
+from copem_replay.pipeline.status import EpisodeClocks, compute_status, read_episode_clocks
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
@@ -71,14 +72,7 @@ from copem_replay.viewer.sink import (
     file_stream,
     split_into_files,
 )
-from copem_replay.viewer.status import (
-    EpisodeClocks,
-    compute_status,
-    read_episode_clocks,
-    write_hiding_lines,
-    write_listing_lines,
-    write_status_words,
-)
+from copem_replay.viewer.status import write_hiding_lines, write_listing_lines, write_status_words
 
 
 def write_rrd(
@@ -332,7 +326,7 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
             WORDS: find_up_rad(file.picture, content.eye, statuses[name].elapsed_ns)[:, None],
             NEAR_WORDS: np.array([[near_up_rad[k] for k in sight.object_ix.tolist()]]),
         }
-        write_status_words(out, name, replay, experiment, sight, statuses[name], clock, up_rad)
+        write_status_words(out, name, replay, experiment, sight, statuses[name], up_rad)
         write_hiding_lines(out, name, sight, statuses[name])
         detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))

@@ -19,11 +19,13 @@ from hypothesis import strategies as st
 from copem_replay.core.colours import TRUTH, configuration_colours
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import read_log
+from copem_replay.perception.sight import HIDDEN
 from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.pipeline.sight import STEADY_S, smooth_status
+from copem_replay.pipeline.sight import ABSENT, STEADY_S, smooth_status
+from copem_replay.pipeline.status import KNOWN, STATUSES
 from copem_replay.results.shown_objects import axis_s, choose_shown_objects
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
@@ -31,7 +33,7 @@ from copem_replay.viewer.camera import camera_following, camera_on_ego, include_
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import lanes_axis_s
 from copem_replay.viewer.sensors import watching_places
-from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_seconds
+from copem_replay.viewer.sink import show_seconds
 from tests.helpers.report_pages import named
 from tests.oracles.colour import apart_for_a_deuteranope, contrast
 from tests.viewer.test_camera import corners, origins, picture

@@ -15,7 +15,8 @@ import pytest
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.tracks import Solid
-from copem_replay.viewer.sink import STATUSES, slice_by_frame, split_into_files
+from copem_replay.pipeline.status import STATUSES
+from copem_replay.viewer.sink import slice_by_frame, split_into_files
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, recording, standing
 from tests.viewer.test_line_of_sight import PERSON, SECTOR, WALL, lines
 from tests.viewer.test_rrd import SUMMARY, Made, at, chunks, make, rows, static
@@ -417,8 +418,7 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
     from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.viewer.sink import CAPTURED, KNOWN, LOST
-    from copem_replay.viewer.status import compute_status, read_episode_clocks
+    from copem_replay.pipeline.status import KNOWN, LOST, UNDER_WAY, compute_status, read_episode_clocks
 
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -435,7 +435,7 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     early = made.elapsed_ns < 450_000_000
     assert set(made.status[early, 0].tolist()) == {LOST}
     assert set(made.status[~early, 0].tolist()) == {KNOWN}
-    assert CAPTURED not in made.status
+    assert UNDER_WAY not in made.status
 
 
 @pytest.mark.parametrize("arrives", [False, True])
@@ -444,8 +444,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from dataclasses import replace
 
     from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.viewer.sink import LOST, UNMATCHED, VISIBLE
-    from copem_replay.viewer.status import compute_status, read_episode_clocks
+    from copem_replay.pipeline.status import IN_SIGHT, LOST, UNMATCHED, compute_status, read_episode_clocks
 
     fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
     received = fused_tracks.received
@@ -461,7 +460,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     )
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
-    assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[VISIBLE]}
+    assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[IN_SIGHT]}
 
 
 def test_nothing_that_is_written_is_nan(hiding: Made) -> None:

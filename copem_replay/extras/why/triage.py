@@ -126,7 +126,7 @@ def _find_bodies(replay: Replay, objects: Int, begin_s: Float, until_s: Float) -
     for k, *between_s in zip(objects.tolist(), begin_s.tolist(), until_s.tolist(), strict=True):
         lasts_s: dict[str, float] = {}
         for span in list_sight_spans(replay, sight, shown.index(k), names, *between_s):
-            if span.state == HIDDEN:
+            if span.status == HIDDEN:
                 lasts_s[span.body] = lasts_s.get(span.body, 0.0) + span.end_s - span.begin_s
         words.append(max(lasts_s, key=lambda body: lasts_s[body], default=""))
     return words
