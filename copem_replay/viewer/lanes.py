@@ -180,11 +180,18 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
     return values, label_of
 
 
+_SHORTER = {
+    "behind": ("behind",), "seen": ("seen",), "out": ("out of view", "out"), "on": ("on way",), "no": ("no unit",),
+    "list": ("lost",), "listed": ("not confirmed", "too late", "listed"),
+}  # fmt: skip
+"""Words taken from those of spans, by the first of these; the longest first."""
+
+
 def _shorten_words(text: str) -> Iterator[str]:
     """Words of a span, the longest first.
 
-    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “old list”, “old”;
-    “out of range or view”, “out of view”.
+    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “seen by ego, not
+    listed”, “not listed”, “seen”; “out of range or view”, “out of view”, “out”.
     """
     yield text.removesuffix(": ")
     if ": " in text:
@@ -194,7 +201,9 @@ def _shorten_words(text: str) -> Iterator[str]:
     yield (short := text.partition(" (from ")[0])
     yield re.sub(rf"^behind ({'|'.join(CLASSES)}) ", "behind ", short)
     yield text.partition(" from ")[0]
-    yield text.replace("range or ", "").removesuffix(" list")
+    yield re.sub("^seen by .*, ", "", text)
+    every = re.findall(r"\w+", text)
+    yield from (words for words in _SHORTER.get(every[0], ()) if {*words.split()} <= {*every})
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 

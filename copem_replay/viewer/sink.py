@@ -62,8 +62,8 @@ WORDS_COLOUR: Rgb = (255, 255, 255)
 DIFFERENCE: Rgb = (255, 255, 255)
 """Marks of objects that only one of two configurations holds."""
 STATUS: dict[int, Rgb] = {
-    OUT_OF_VIEW: (46, 58, 98),
-    UNLISTED: (92, 68, 40),
+    OUT_OF_VIEW: (72, 68, 144),
+    UNLISTED: (92, 76, 48),
     HIDDEN: (205, 160, 100),
     IN_SIGHT: (76, 78, 80),
     LOST: (236, 216, 180),

@@ -54,7 +54,9 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
     [_, story] = story_parts(study)
     said = re.sub(r"<svg.*</svg>", "", story, flags=re.DOTALL)
     assert "late: behind car 9 (from ego) to the end, never known; " in said
-    assert "half: on its way from mast until 0.30 s, known after 0.30 s, by the list of mast, which arrives 0.30 s" in said
+    assert (
+        "half: on its way from mast until 0.30 s, known after 0.30 s, by the list of mast, which arrives 0.30 s" in said
+    )
     assert "copem-replay view FOLDER --object 3" not in said, "no run is shown"
     assert 'viewBox="0 0 960 360"' in story
 
