@@ -53,8 +53,8 @@ ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
 WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
-MOST_NAME = 0.52
-"""Most of a lane's width that is before the onset, for the name."""
+MOST_NAME, LEAST_NAME = 0.52, 8
+"""Most of a lane's width that is before the onset, for the name, and the letters of one that is cut."""
 
 
 def write_lanes(
@@ -107,7 +107,7 @@ def _tell_lane(
     colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
     elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
     until_ns = min(onset_ns - mark_ns, known_ns)
-    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
+    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(min(len(name), LEAST_NAME)) / WIDTH_POINTS:
         title = f"{name}{flag}: "
         elapsed, texts = _insert_title(elapsed, texts, title, first_ns, until_ns)
     else:
@@ -132,6 +132,8 @@ def lanes_axis_s(
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
     end_s = max(axis_s[1] - AFTER_S, start_s)
     length_s = max((end_s - start_s) / (1 - name - flag), LEAST_S)
+    if start_s < name * length_s:  # nothing is before the log's start: then names have what room there is
+        length_s = max(end_s / (1 - flag), LEAST_S)
     first_s = max(start_s - name * length_s, 0.0)
     return first_s, max(first_s + length_s, end_s + flag * length_s)
 
@@ -173,11 +175,18 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
             values.append(text)
             continue
         room = (wide - PADDING_POINTS) / LETTER_POINTS if wide > 0 else len(text)
-        label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
+        label = next((words for words in _shorten_words(text) if len(words) <= room), _cut_name(text, int(room)))
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
         values.append(value)
     return values, label_of
+
+
+def _cut_name(text: str, room: int) -> str:
+    """What fits of the name in a text: “old:fus…_gnn”; a space where there is none, or no room."""
+    title, colon, _ = text.partition(": ")
+    name = re.sub(r", -?[0-9.]+ s(, lost)?$", "", title)
+    return f"{name[: room // 2]}…{name[len(name) - (room - 1) // 2 :]}" if colon and room > 2 else " "
 
 
 _SHORTER = {
@@ -243,7 +252,7 @@ def _insert_title(
 def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int) -> None:
     """Put the title before the first text on the axis, “PEM: hidden”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
-    told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
+    told_at = next((k for k in range(current, len(texts)) if texts[k] not in (None, *ONSET_IS)), None)
     if told_at is not None:
         texts[told_at] = f"{title}{texts[told_at]}"
 
