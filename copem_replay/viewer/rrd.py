@@ -235,7 +235,9 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
     helps = {k: content.helps(k) for k in content.objects}
-    write_difference_text(out, replay, rows, helps, further, content.too_short)
+    counted = content.counted if content.counted is not None else rows
+    counted = counted[counted["configuration"].isin(list(content.configurations))]
+    write_difference_text(out, replay, rows, helps, further, content.too_short, counted)
     write_summary_text(out, replay, experiment, summary, run, further)
     out.static(["false"], rr.TextDocument(content.tell_false(), media_type=rr.MediaType.MARKDOWN))
     write_legend_text(out, any(content.lists.values()))
