@@ -165,6 +165,7 @@ def _find_object_lists(lists: Tracks, unit: int, object_ix: int, issued_ns: Floa
     frames = frames[np.argsort(lists.captured_s[frames], kind="stable")]
     arrives_ns = lists.common_arrives_s[frames] * 1e9
     taken_ns = issued_ns[np.searchsorted(issued_ns, arrives_ns - SAME_INSTANT_NS)]
+    taken_ns = np.where(np.isfinite(taken_ns), taken_ns, np.rint(arrives_ns))  # after the last fused list
     all_captured_ns = np.sort(to_nanoseconds(lists.captured_s[lists.frame_unit_ix == unit]))
     return to_nanoseconds(lists.captured_s[frames]), taken_ns, all_captured_ns
 

@@ -438,6 +438,25 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     assert UNDER_WAY not in made.status
 
 
+def test_a_list_that_arrives_after_the_last_fused_one_is_on_its_way(hiding: Made) -> None:
+    from dataclasses import replace
+
+    from copem_replay.pipeline.sight import compute_sight
+    from copem_replay.pipeline.status import UNDER_WAY, compute_status, read_episode_clocks
+
+    tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
+    received = replace(tracks.received, arrives_s=tracks.received.captured_s[None] + 10.0)
+    nothing = replace(tracks.fused, valid=np.zeros_like(tracks.fused.valid))
+    seen = compute_sight(hiding.replay, hiding.given, [number])
+    clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
+    made = compute_status(
+        hiding.replay, hiding.given, "both", replace(tracks, received=received, fused=nothing), seen, clock
+    )
+    there = made.elapsed_ns < 2_000_000_000
+    assert set(made.status[there, 0].tolist()) == {UNDER_WAY}
+    assert made.until_s[0, 0] == pytest.approx(10.0)
+
+
 @pytest.mark.parametrize("arrives", [False, True])
 def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hiding: Made, arrives: bool) -> None:
     """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
