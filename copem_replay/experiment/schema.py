@@ -574,10 +574,10 @@ class Experiment(Frozen):
         return self._has_areas or bool(self.areas or self.maps)
 
     def has_way(self, name: str) -> bool:
-        """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`."""
+        """Whether lists of a configuration come by a link, with `issue_hz`, or of a unit with `ready` or `sends`."""
         configuration = self.configurations[name]
         units = self.units_of(configuration)
-        if any(self.units[unit].ready is not None or self.units[unit].sends is not None for unit in units):
+        if configuration.issue_hz or any(self.units[unit].ready or self.units[unit].sends for unit in units):
             return True
         return any(configuration.link_of(unit) is not None for unit in units or (TRUTH,))
 

@@ -40,8 +40,8 @@ class Column:
     """A column of a file, or a key of `provenance.json`.
 
     `kind`: text, text or null, numbers, whole numbers, true or false, or lists of these. `when`: what an experiment
-    has to ask for (`braking`, `conflict`, `needless`, `accuracy`, `areas`; `link`: a link, `ready` or `sends`; `fleet`:
-    units that only some runs have); empty: it is always there. `compared`: whether comparisons read it. `single`: in
+    has to ask for (`braking`, `conflict`, `needless`, `accuracy`, `areas`; `link`: also `issue_hz`, `ready`, `sends`;
+    `fleet`: units that only some runs have); empty: it is always there. `compared`: comparisons read it. `single`: in
     single precision. `full`: no row is without it. `infinite`: numbers may be infinite. `among`: the words it may have;
     empty: any.
     """

@@ -70,7 +70,7 @@ class Way:
 
 
 WAY = tuple(Way.__dataclass_fields__)
-"""Columns of `detections.parquet`, its last, where a configuration has a link or units with `ready` or `sends`."""
+"""Columns of `detections.parquet`, its last, where a configuration has a link, `issue_hz`, `ready` or `sends`."""
 
 
 def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
@@ -132,7 +132,7 @@ class DetectionEvents:
     """Detections of one configuration, run by run: (S, M), or (1, M) where all runs agree.
 
     `units`: names of the units that `detections` counts. `conflict_known_s`: when a list first implied a collision,
-    NaN: never. `way`: None where the configuration has neither a link nor units with `ready` or `sends`.
+    NaN: never. `way`: None where the configuration has neither a link nor `issue_hz`, `ready` or `sends`.
     """
 
     units: tuple[str, ...]

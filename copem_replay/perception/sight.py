@@ -18,8 +18,10 @@ from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.config import PerceptionSetup
 from copem_replay.perception.observation import Observations, assess_view, rows_by_unit
 
-NO_UNIT, OUT_OF_VIEW, HIDDEN, IN_SIGHT = range(4)
-"""The better the higher: of several units the best counts. No unit: it is not there, or the object carries it."""
+NO_UNIT, OUT_OF_VIEW, HIDDEN, IN_SIGHT = range(1, 5)
+"""The better the higher: of several units the best counts. No unit: it is not there, or the object carries it.
+
+`pipeline/status.py` goes on from here; 0 is an object that is not in the log."""
 
 
 def judge_sight(pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags: Mapping[str, str]) -> Int:
@@ -101,7 +103,7 @@ def find_sight_changes(
 ) -> SightChanges:
     """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none."""
     tracks = observations.tracks
-    state = np.zeros(len(episode_ix), dtype=np.int64)
+    state = np.full(len(episode_ix), NO_UNIT)
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         rows = rows[episode_ix[rows] >= 0]
         state[rows] = judge_sight(str(unit.pem), experiment, observations.view.take(rows), tags)

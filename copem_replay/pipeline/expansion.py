@@ -188,7 +188,7 @@ class ExpandedExperiment(Experiment):
         return self.unit_links[name]
 
     def has_way(self, name: str) -> bool:
-        """Whether lists of a configuration come by a link, or of a unit with `ready` or `sends`, in the study."""
+        """Whether the way of a configuration's lists is measured, in the study."""
         return name in self.ways
 
     def linked(self, name: str) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from copem_replay.perception.visibility import VisibilityModel, find_blockers, v
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 
-ABSENT = -1
+ABSENT = 0
 """The state of an object that is not in the log; others are those of `perception/sight.py`."""
 
 ROWS_AT_ONCE = 60_000
@@ -78,8 +78,7 @@ STEADY_S = 0.4
 """Shorter spans become part of those around them: their words could not be read."""
 
 
-@dataclass(frozen=True)
-class Span:
+class Span(NamedTuple):
     """The prevailing status of the instants `first` to `end`, without `end`."""
 
     first: int
@@ -96,7 +95,8 @@ def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, ke
     """
     steady_ns = round(STEADY_S * 1e9)
     first = np.flatnonzero(np.diff(status, prepend=-1))
-    values, lasts = status[first], np.diff(elapsed_ns[first], append=end_ns or elapsed_ns[-1] + steady_ns)
+    end_ns = elapsed_ns[-1] + steady_ns if end_ns is None else end_ns
+    values, lasts = status[first], np.diff(elapsed_ns[first], append=end_ns)
     long_enough = lasts >= steady_ns
     long_enough[np.flatnonzero(values == kept)[:1]] = True
     spans: list[Span] = []
@@ -111,16 +111,18 @@ def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, ke
             spans.append(Span(int(first[k]), len(status), int(duration_by_status.argmax())))
         k = end
     merged = [span for n, span in enumerate(spans) if n == 0 or span.status != spans[n - 1].status]
-    return [replace(span, end=after.first) for span, after in pairwise([*merged, Span(len(status), 0, 0)])]
+    return [span._replace(end=after.first) for span, after in pairwise([*merged, Span(len(status), 0, 0)])]
 
 
 @dataclass(frozen=True)
-class SightSpan:
-    """A time from `begin_s` to `end_s`, seconds since the log's start, in which the units of a configuration have an
-    object in one state; of a hidden one from whom, `unit`, and by what, `body`, in words and as in `Sight.body_ix`.
+class StatusSpan:
+    """A time from `begin_s` to `end_s`, seconds since the log's start, in which an object has one status.
+
+    `unit`: the one that it is mostly about, “”: none; of a hidden object from whom, and by what, `body`, in words and
+    as in `Sight.body_ix`.
     """
 
-    state: int
+    status: int
     begin_s: float
     end_s: float
     unit: str = ""
@@ -128,31 +130,54 @@ class SightSpan:
     body_ix: int = 0
 
 
+class SpanNames(NamedTuple):
+    """Names of units, and of bodies as in `Sight.body_ix`."""
+
+    units: Sequence[str]
+    bodies: Sequence[str]
+
+
+def list_spans(
+    sight: Sight, m: int, told: tuple[Int, ...], names: SpanNames, until_s: float, kept: int = -1
+) -> list[StatusSpan]:
+    """The spans of object m until an instant. `kept`: as in `smooth_status`.
+
+    `told`: instants (K,) in ns since the log's start, and at each the status, its unit, −1: none, and the frame.
+    """
+    begins_ns, status, unit_ix, frame = told
+    ends_s, spans = np.append(begins_ns * 1e-9, until_s).tolist(), list[StatusSpan]()
+    for first, end, of in smooth_status(begins_ns, status, end_ns=round(until_s * 1e9), kept=kept):
+        rows = np.arange(first, end)[status[first:end] == of]
+        by, body_ix, body = int(np.bincount(unit_ix[rows] + 1).argmax()) - 1, 0, ""
+        if of == HIDDEN:
+            by, body_ix = sight.find_hider(unit_ix[rows], frame[rows], m)
+            body = names.bodies[body_ix]
+        spans.append(StatusSpan(of, ends_s[first], ends_s[end], names.units[by] if by >= 0 else "", body, body_ix))
+    return spans
+
+
+def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
+    """The instants, of ascending ones (K,), that hold anywhere between two times."""
+    time_s = elapsed_ns * 1e-9
+    return np.flatnonzero(
+        (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
+    )
+
+
 def list_sight_spans(
     replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
-) -> list[SightSpan]:
-    """What the units `names` have of object m, while it is there between two instants; nothing of recorded units."""
+) -> list[StatusSpan]:
+    """What the units `names` have of object m between two instants; nothing of recorded units."""
     every = list(replay.expanded.units)
     sensing = replay.expanded.list_sensing(names)
     units = [every.index(name) for name in sensing if name in replay.expanded.modelled]
-    time_s = sight.elapsed_ns * 1e-9
-    frames = np.flatnonzero(
-        (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
-    )
+    frames = within(sight.elapsed_ns, from_s, until_s)
     if not units or not len(frames):
         return []
     state, unit_ix = (values[frames] for values in sight.find_best(units, m))
     begins_ns = np.maximum(sight.elapsed_ns[frames], round(from_s * 1e9))
-    bodies, spans = name_bodies(replay.scene, sight.solids, replay.scene.object_ids), list[SightSpan]()
-    for span in smooth_status(begins_ns, state - ABSENT, end_ns=round(until_s * 1e9)):
-        end_s = until_s if span.end == len(frames) else float(begins_ns[span.end]) * 1e-9
-        what: dict[str, Any] = {}
-        if (of := span.status + ABSENT) == HIDDEN:
-            of_span = np.arange(span.first, span.end)[state[span.first : span.end] == HIDDEN]
-            by, body_ix = sight.find_hider(unit_ix[of_span], frames[of_span], m)
-            what = {"unit": every[by], "body": bodies[body_ix], "body_ix": body_ix}
-        spans.append(SightSpan(of, float(begins_ns[span.first]) * 1e-9, end_s, **what))
-    return [span for span in spans if span.state != ABSENT]
+    bodies = name_bodies(replay.scene, sight.solids, replay.scene.object_ids)
+    return list_spans(sight, m, (begins_ns, state, unit_ix, frames), SpanNames(every, bodies), until_s)
 
 
 def name_bodies(scene: Scene, solids: Sequence[str], ids: Sequence[str]) -> list[str]:

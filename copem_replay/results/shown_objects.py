@@ -64,6 +64,11 @@ def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, ta
     return ShownObjects(chosen, tuple(episodes.index[~episodes["observed"]].tolist()))
 
 
+def is_observed(episodes: pd.DataFrame) -> pd.Series:
+    """Whether each of some episodes, given by `onset_s` and `ended_s`, is not too short to judge."""
+    return np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"]) >= OBSERVED_S - SAME_INSTANT_S
+
+
 def measure_apart(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
     """By id of the objects of one run of one log: `apart_s`, how much later one configuration knows it than another,
     at most, without what it usually is later than that: by medians over the objects that are `observed` long enough.
@@ -75,10 +80,9 @@ def measure_apart(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
     rows = rows.assign(after_s=rows["time_to_detection_s"].fillna(rows["ended_s"] - rows["onset_s"]))
     by_object = rows.groupby("object_id", sort=False)
     episodes = by_object[["onset_s", "ended_s"]].first()
-    least_s = np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"])
-    episodes["observed"] = observed = least_s >= OBSERVED_S - SAME_INSTANT_S
+    episodes["observed"] = observed = is_observed(episodes)
     after_s = rows.groupby(["object_id", "configuration"])["after_s"].first().unstack().loc[episodes.index]
-    usual_s = after_s[observed if observed.any() else least_s >= 0].quantile(0.5, interpolation="lower")
+    usual_s = after_s[observed | ~observed.any()].quantile(0.5, interpolation="lower")
     later_s = [after_s.sub(after_s[name], axis=0) - (usual_s - usual_s[name]).clip(lower=0.0) for name in after_s]
     episodes["apart_s"] = np.max([of.max(axis=1) for of in later_s], axis=0)
     episodes["apart_raw_s"] = after_s.max(axis=1) - after_s.min(axis=1)

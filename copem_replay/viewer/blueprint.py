@@ -13,6 +13,7 @@ from copem_replay.core.tracks import CLASSES, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
 from copem_replay.viewer.camera import Camera
@@ -34,7 +35,6 @@ from copem_replay.viewer.sink import (
     object_lanes_path,
     short_ids,
     show_seconds,
-    to_nanoseconds,
 )
 
 if TYPE_CHECKING:
@@ -166,9 +166,10 @@ class RecordingContent:
     @property
     def selected_ns(self) -> tuple[int, int]:
         """The time that is selected, ns since the log's start: from the first onset to the end."""
-        onset_ns = int(to_nanoseconds(self.table["onset_s"].min())) if len(self.table) else 0
-        scene = self.replay.scene
-        return onset_ns, max(scene.end_ns - scene.t0_ns, onset_ns)
+        first_s = float(self.table["onset_s"].min()) if len(self.table) else 0.0
+        first_s = first_s if self.opens_s is None or not self.baselines else self.opens_s
+        scene, first_ns = self.replay.scene, int(to_nanoseconds(first_s))
+        return first_ns, max(scene.end_ns - scene.t0_ns, first_ns)
 
 
 def make_time_axis(first_s: float, last_s: float) -> rrb.TimeAxis:
@@ -464,7 +465,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 7
+LAYOUT = 8
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 
@@ -483,7 +484,7 @@ def build_blueprint(content: RecordingContent) -> rrb.Blueprint:
     # A blueprint cannot set the time cursor, but playing begins with the selection: at the first onset.
     panel = rrb.TimePanel(
         timeline=ELAPSED,
-        play_state="paused",
+        play_state="playing" if content.baselines else "paused",
         loop_mode="selection",
         state="collapsed",
         time_selection=rrb.components.AbsoluteTimeRange(*content.selected_ns),

@@ -13,6 +13,7 @@ import pyarrow as pa
 from copem_replay.core.tracks import Float, Int
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.results.shown_objects import find_followed, interpolate_places
 from copem_replay.viewer.sink import (
     WORDS_COLOUR,
@@ -21,7 +22,6 @@ from copem_replay.viewer.sink import (
     entity_names,
     short_ids,
     stack_float32,
-    to_nanoseconds,
     upright_turns,
 )
 

@@ -31,19 +31,18 @@ from copem_replay.metrics.gospa import gospas_m
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.scoring import accuracy_settings
+from copem_replay.pipeline.status import elapsed_ns, to_nanoseconds
 from copem_replay.viewer.sink import (
     DIFFERENCE,
     EGO,
     RecordingSink,
     configuration_part,
-    elapsed_ns,
     entity_names,
     join_points,
     plain_part,
     sort_by_frame,
     stack_float32,
     table_rows,
-    to_nanoseconds,
 )
 
 LISTS_AT_ONCE = 2_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from copem_replay.metrics.survival import EndReason
 from copem_replay.perception.sensor_poses import find_carrier
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.viewer.sink import (
     DIFFERENCE_SHORT,
     DIFFERENCE_TEXT,
@@ -32,7 +33,6 @@ from copem_replay.viewer.sink import (
     show_seconds,
     stack_float32,
     table_rows,
-    to_nanoseconds,
 )
 
 # Text panels: events, differences, summary, legend.
@@ -159,13 +159,13 @@ def describe_verdict(episode: Any) -> str | None:
 
 def write_difference_text(
     out: RecordingSink, replay: Replay, table: pd.DataFrame, shown: Mapping[int, str], left_out: Sequence[str],
-    too_short: Sequence[str],
+    too_short: Sequence[str], counted: pd.DataFrame,
 ) -> None:  # fmt: skip
     """Write tables of times to detection in this run: over all objects, if there are several, then per object.
 
     `shown`: the objects, with a sentence of what would help, or “”, which is below the table of each; in the overview
-    it is that of the first one. Below them are the files with further configurations, and the objects `too_short` to
-    judge.
+    it is that of the first one. Below them are how many these are of those that count (rows `counted`), who else is
+    never known, the objects `too_short` to judge, and the files with further configurations.
     """
     import rerun as rr
 
@@ -185,9 +185,25 @@ def write_difference_text(
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
     among = "; what is shown here is among them" if {replay.scene.object_ids[k] for k in shown} & {*too_short} else ""
     short = [f"Too short to judge: {_escape_cell(', '.join(ids))}{among}."] if ids else []
+    others = [_escape_cell(line) for line in _describe_others(counted, replay.scene, shown)]
     for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
-        text = "\n\n".join([*parts, *short, *_describe_left_out(left_out)])
+        text = "\n\n".join([*parts, *others, *short, *_describe_left_out(left_out)])
         out.static(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, str]) -> Iterator[str]:
+    """“Shown: 6 of 49 that count. Of the others never known: 134, 99 with late.”; nothing where all are here."""
+    names, others = (
+        counted["configuration"].nunique(),
+        counted[~counted["object_id"].isin([scene.object_ids[k] for k in shown])],
+    )
+    if not len(others):
+        return
+    here = f"Shown: {len(shown)} of {len(counted) // names} that count"
+    missed = others[~others["detected"].astype(bool)].groupby("object_id", sort=False)["configuration"].unique()
+    ids = {name: short_ids(scene)[scene.object_number[name]] for name in missed.index}
+    words = [ids[name] + ("" if len(of) == names else f" with {', '.join(of)}") for name, of in missed.items()]
+    yield f"{here}." + (f" Of the others never known: {', '.join(words)}." if words else "")
 
 
 def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:

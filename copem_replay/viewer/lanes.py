@@ -23,18 +23,15 @@ import pyarrow as pa
 from copem_replay.communication.arrivals import find_overtaken_lists
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH, Float, Int, Scene
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Float, Int, Scene
 from copem_replay.experiment.schema import Experiment
-from copem_replay.pipeline.sight import Sight, Span, name_bodies, smooth_status
+from copem_replay.pipeline.sight import ABSENT, STEADY_S, Sight, SpanNames, list_spans, name_bodies, smooth_status
+from copem_replay.pipeline.status import KNOWN, UNDER_WAY, UNMATCHED, EpisodeClocks, Status, to_nanoseconds
+from copem_replay.pipeline.status import LOST as LIST_LOST
 from copem_replay.results.shown_objects import AFTER_S, BEFORE_S, LEAST_S
 from copem_replay.viewer.sink import (
-    ABSENT,
-    CAPTURED,
-    HIDDEN,
-    KNOWN,
     ONSET,
     STATUS,
-    UNMATCHED,
     RecordingSink,
     configuration_part,
     lane_path,
@@ -43,10 +40,8 @@ from copem_replay.viewer.sink import (
     short_ids,
     show_seconds,
     status_colour,
-    to_nanoseconds,
 )
-from copem_replay.viewer.sink import LOST as LIST_LOST
-from copem_replay.viewer.status import EpisodeClocks, Status, lane_text
+from copem_replay.viewer.status import lane_text
 
 MARK = 1 / 40
 """Length of the mark that ends at the onset, as a share of the axis: just wide enough for both halves."""
@@ -58,8 +53,8 @@ ONSET_IS = ("onset", "onset of the object")
 """The two halves of the mark."""
 WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""
-MOST_NAME = 0.52
-"""Most of a lane's width that is before the onset, for the name."""
+MOST_NAME, LEAST_NAME = 0.52, 8
+"""Most of a lane's width that is before the onset, for the name, and the letters of one that is cut."""
 
 
 def write_lanes(
@@ -72,21 +67,27 @@ def write_lanes(
     """
     import rerun as rr
 
-    bodies, units = name_bodies(scene, sight.solids, short_ids(scene)), [*experiment.units, TRUTH]
+    names = SpanNames([*experiment.units], name_bodies(scene, sight.solids, short_ids(scene)))
     for m, k in enumerate(sight.object_ix.tolist()):
         axis_ns = tuple(to_nanoseconds(axes[k]).tolist())
         for place, (name, status) in enumerate(statuses.items()):
             if not len(status.elapsed_ns):
                 continue
-            spans = smooth_status(status.elapsed_ns, status.status[:, m], kept=KNOWN)
-            texts = [_span_text(bodies, units, sight, status, m, span) for span in spans]
-            begins = status.elapsed_ns[[span.first for span in spans]]
-            tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
+            cut, end_ns = np.searchsorted(status.elapsed_ns, clock_ns[0]), status.elapsed_ns[-1] + STEADY_S * 1e9
+            told = status.elapsed_ns, status.status[:, m], status.unit_ix[:, m], status.frame
+            spans = [  # the onset is a border: before it words do not tell why an object is unknown
+                span
+                for rows, until_ns in ((slice(cut), min(clock_ns[0], end_ns)), (slice(cut, None), end_ns))
+                for span in list_spans(sight, m, tuple(of[rows] for of in told), names, until_ns * 1e-9, kept=KNOWN)
+            ]
+            texts = [None if span.status == ABSENT else lane_text(span) for span in spans]
+            begins = to_nanoseconds([span.begin_s for span in spans])
+            tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             elapsed, values, styles = _tell_lane(begins, texts, tints, name, clock_ns, axis_ns)
             path = lane_path(scene, k, place, name)
-            told = [value for value in values if value is not None]  # the row is empty while the object is absent
-            states = rr.StateChange.columns(state=pa.array(told, pa.string()))
+            there = [value for value in values if value is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(there, pa.string()))
             out.columns(path, elapsed, states.partition(np.array([v is not None for v in values], dtype=np.int64)))
             labels, drawn = zip(*styles.values(), strict=True)
             out.static(path, rr.StateConfiguration(values=list(styles), labels=list(labels), colors=list(drawn)))
@@ -106,7 +107,7 @@ def _tell_lane(
     colour_of = {text: tint for text, tint in zip(texts, tints, strict=True) if text}
     elapsed, texts = _insert_onset(begins, texts, onset_ns, mark_ns)
     until_ns = min(onset_ns - mark_ns, known_ns)
-    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(len(name)) / WIDTH_POINTS:
+    if until_ns - first_ns >= (last_ns - first_ns) * _words_points(min(len(name), LEAST_NAME)) / WIDTH_POINTS:
         title = f"{name}{flag}: "
         elapsed, texts = _insert_title(elapsed, texts, title, first_ns, until_ns)
     else:
@@ -131,6 +132,8 @@ def lanes_axis_s(
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
     end_s = max(axis_s[1] - AFTER_S, start_s)
     length_s = max((end_s - start_s) / (1 - name - flag), LEAST_S)
+    if start_s < name * length_s:  # nothing is before the log's start: then names have what room there is
+        length_s = max(end_s / (1 - flag), LEAST_S)
     first_s = max(start_s - name * length_s, 0.0)
     return first_s, max(first_s + length_s, end_s + flag * length_s)
 
@@ -172,18 +175,32 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
             values.append(text)
             continue
         room = (wide - PADDING_POINTS) / LETTER_POINTS if wide > 0 else len(text)
-        label = next((words for words in _shorten_words(text) if len(words) <= room), " ")
+        label = next((words for words in _shorten_words(text) if len(words) <= room), _cut_name(text, int(room)))
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
         values.append(value)
     return values, label_of
 
 
+def _cut_name(text: str, room: int) -> str:
+    """What fits of the name in a text: “old:fus…_gnn”; a space where there is none, or no room."""
+    title, colon, _ = text.partition(": ")
+    name = re.sub(r", -?[0-9.]+ s(, lost)?$", "", title)
+    return f"{name[: room // 2]}…{name[len(name) - (room - 1) // 2 :]}" if colon and room > 2 else " "
+
+
+_SHORTER = {
+    "behind": ("behind",), "seen": ("seen",), "out": ("out of view", "out"), "on": ("on way",), "no": ("no unit",),
+    "list": ("lost",), "listed": ("not confirmed", "too late", "listed"),
+}  # fmt: skip
+"""Words taken from those of spans, by the first of these; the longest first."""
+
+
 def _shorten_words(text: str) -> Iterator[str]:
     """Words of a span, the longest first.
 
-    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “old list”, “old”;
-    “out of range or view”, “out of view”.
+    “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “seen by ego, not
+    listed”, “not listed”, “seen”; “out of range or view”, “out of view”, “out”.
     """
     yield text.removesuffix(": ")
     if ": " in text:
@@ -193,24 +210,11 @@ def _shorten_words(text: str) -> Iterator[str]:
     yield (short := text.partition(" (from ")[0])
     yield re.sub(rf"^behind ({'|'.join(CLASSES)}) ", "behind ", short)
     yield text.partition(" from ")[0]
-    yield text.replace("range or ", "").removesuffix(" list")
+    yield re.sub("^seen by .*, ", "", text)
+    every = re.findall(r"\w+", text)
+    yield from (words for words in _SHORTER.get(every[0], ()) if {*words.split()} <= {*every})
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
-
-
-def _span_text(
-    bodies: Sequence[str], units: Sequence[str], sight: Sight, status: Status, m: int, span: Span
-) -> str | None:
-    """The text of a span, with its most frequent unit and hiding body; None while the object is absent."""
-    if span.status == ABSENT:
-        return None
-    rows = np.arange(span.first, span.end)
-    rows = rows[status.status[rows, m] == span.status]
-    unit_ix = status.unit_ix[rows, m]
-    if span.status == HIDDEN:
-        by, body = sight.find_hider(unit_ix, status.frame[rows], m)
-        return lane_text(HIDDEN, units[by], bodies[body])
-    return lane_text(span.status, units[int(np.bincount(unit_ix + 1).argmax()) - 1], "")
 
 
 def _add_flag(begins: Int, texts: list[str | None], known_ns: int, onset_ns: int, room_ns: int) -> str:
@@ -248,7 +252,7 @@ def _insert_title(
 def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_ns: int) -> None:
     """Put the title before the first text on the axis, “PEM: hidden”: it has no room of its own."""
     current = max(int(np.searchsorted(elapsed_ns, first_ns, side="right")) - 1, 0)
-    told_at = next((k for k in range(current, len(texts)) if texts[k] is not None), None)
+    told_at = next((k for k in range(current, len(texts)) if texts[k] not in (None, *ONSET_IS)), None)
     if told_at is not None:
         texts[told_at] = f"{title}{texts[told_at]}"
 
@@ -271,7 +275,7 @@ def _insert_onset(
 
 FATES = ("in time", "lost", "late", "overtaken")
 IN_TIME, LOST, LATE, OVERTAKEN = range(len(FATES))
-COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[CAPTURED], OVERTAKEN: STATUS[UNMATCHED]}
+COLOURS: dict[int, Rgb] = {LOST: STATUS[LIST_LOST], LATE: STATUS[UNDER_WAY], OVERTAKEN: STATUS[UNMATCHED]}
 """Colours in lanes, as in an object's lane: lost, captured (under way) and unmatched."""
 QUIET_S, TOLD_S = 1.0, 5.0
 """Lists of one fate share a row of the events if they are no more than the first apart, up to the second after the

@@ -7,20 +7,14 @@ from typing import TYPE_CHECKING
 
 from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
 from copem_replay.core.colours import Rgb
+from copem_replay.perception.sight import HIDDEN, IN_SIGHT, OUT_OF_VIEW
+from copem_replay.pipeline.status import EARLY, LOST, UNDER_WAY, UNLISTED, UNMATCHED
 from copem_replay.viewer.sink import (
-    CAPTURED,
-    EARLY,
     EGO,
     FIELD,
     GROUND,
-    HIDDEN,
     HIDES,
-    LOST,
-    OUT,
     STATUS,
-    UNLISTED,
-    UNMATCHED,
-    VISIBLE,
     WORDS_COLOUR,
     RecordingSink,
     scale_colour,
@@ -43,8 +37,8 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
 )
 _FALSE, _DISC = _MARKS[-1][0], "disc: place ± 2σ"
 _STATUSES = {
-    OUT: "out of range or view", HIDDEN: "hidden", VISIBLE: "seen, not listed", UNLISTED: "not listed",
-    LOST: "list lost", CAPTURED: "on its way", UNMATCHED: "unmatched",
+    OUT_OF_VIEW: "out of range or view", HIDDEN: "hidden", IN_SIGHT: "seen, not listed", UNLISTED: "not listed",
+    LOST: "list lost", UNDER_WAY: "on its way", UNMATCHED: "unmatched",
 }  # fmt: skip
 """Words of statuses in lanes, in the order in which they follow each other."""
 _BROAD_POINTS = 4.0

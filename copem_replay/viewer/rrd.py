@@ -26,6 +26,7 @@ from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import Sight, compute_sight, find_looked_at
+from copem_replay.pipeline.status import EpisodeClocks, compute_status, read_episode_clocks
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
@@ -71,14 +72,7 @@ from copem_replay.viewer.sink import (
     file_stream,
     split_into_files,
 )
-from copem_replay.viewer.status import (
-    EpisodeClocks,
-    compute_status,
-    read_episode_clocks,
-    write_hiding_lines,
-    write_listing_lines,
-    write_status_words,
-)
+from copem_replay.viewer.status import write_hiding_lines, write_listing_lines, write_status_words
 
 
 def write_rrd(
@@ -241,7 +235,9 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
     helps = {k: content.helps(k) for k in content.objects}
-    write_difference_text(out, replay, rows, helps, further, content.too_short)
+    counted = content.counted if content.counted is not None else rows
+    counted = counted[counted["configuration"].isin(list(content.configurations))]
+    write_difference_text(out, replay, rows, helps, further, content.too_short, counted)
     write_summary_text(out, replay, experiment, summary, run, further)
     out.static(["false"], rr.TextDocument(content.tell_false(), media_type=rr.MediaType.MARKDOWN))
     write_legend_text(out, any(content.lists.values()))
@@ -332,7 +328,7 @@ def _write_knowledge(file: _RecordingFile, run_tracks: Mapping[str, FusedTracks]
             WORDS: find_up_rad(file.picture, content.eye, statuses[name].elapsed_ns)[:, None],
             NEAR_WORDS: np.array([[near_up_rad[k] for k in sight.object_ix.tolist()]]),
         }
-        write_status_words(out, name, replay, experiment, sight, statuses[name], clock, up_rad)
+        write_status_words(out, name, replay, experiment, sight, statuses[name], up_rad)
         write_hiding_lines(out, name, sight, statuses[name])
         detections = content.table[(content.table["configuration"] == name) & content.table["detected"]]
         first_unit = dict(zip(detections["object_id"].map(scene.object_number), detections["first_unit"], strict=True))

@@ -29,20 +29,11 @@ from copem_replay.core.colours import Rgb
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.files import atomic_file
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
+from copem_replay.perception.sight import HIDDEN, IN_SIGHT, OUT_OF_VIEW
+from copem_replay.pipeline.status import EARLY, KNOWN, LOST, UNDER_WAY, UNLISTED, UNMATCHED, elapsed_ns
 
 if TYPE_CHECKING:
     import rerun as rr
-
-
-# Statuses of an object in a configuration, by number; `viewer/status.py` defines them.
-
-STATUSES = (
-    "absent", "not listed", "out of range or view", "hidden", "visible", "lost", "captured", "unmatched",
-    "listed before the onset", "listed, not confirmed", "listed too late", "known",
-)  # fmt: skip
-(
-    ABSENT, UNLISTED, OUT, HIDDEN, VISIBLE, LOST, CAPTURED, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN,
-) = range(len(STATUSES))  # fmt: skip
 
 
 # Colours of everything but configurations: ground, truth, statuses, words.
@@ -71,12 +62,12 @@ WORDS_COLOUR: Rgb = (255, 255, 255)
 DIFFERENCE: Rgb = (255, 255, 255)
 """Marks of objects that only one of two configurations holds."""
 STATUS: dict[int, Rgb] = {
-    OUT: (46, 58, 98),
-    UNLISTED: (92, 68, 40),
+    OUT_OF_VIEW: (72, 68, 144),
+    UNLISTED: (92, 76, 48),
     HIDDEN: (205, 160, 100),
-    VISIBLE: (76, 78, 80),
+    IN_SIGHT: (76, 78, 80),
     LOST: (236, 216, 180),
-    CAPTURED: (140, 165, 225),
+    UNDER_WAY: (140, 165, 225),
     UNMATCHED: (205, 220, 250),
 }
 """Statuses in which the receiver's list does not hold the object; one colour for all configurations."""
@@ -360,20 +351,9 @@ def slice_by_frame(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]
         frame, row = last, int(ends[last - 1])
 
 
-def to_nanoseconds(time_s: Any) -> Any:
-    """Seconds as whole nanoseconds."""
-    return np.rint(np.asarray(time_s) * 1e9).astype(np.int64)
-
-
 def show_seconds(time_s: float) -> str:
     """Seconds with two decimals, never `-0.00`."""
     return f"{round(time_s, 2) + 0.0:.2f}"
-
-
-def elapsed_ns(tracks: Tracks) -> Int:
-    """(F,) when each list is available, ns since the log's start."""
-    elapsed: Int = to_nanoseconds(tracks.common_arrives_s)
-    return elapsed
 
 
 def stack_float32(*columns: Float) -> np.ndarray:

@@ -1,13 +1,14 @@
 """One set of facts: lanes, stories, stages and causes name the same of an object and a configuration.
 
-By hand in a scene where a car hides, one is beyond the range, one is missed, and lists are late; then over the objects
-that viewers show of recordings, with the experiment that `init` drafts.
+By hand in a scene where a car hides, one is beyond the range, one is missed, and lists are late, lost, taken in at
+ticks or not confirmed; then over the objects that viewers show of recordings, with the experiment that `init` drafts.
 """
 
 from __future__ import annotations
 
 import re
 from html import unescape
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.extras.stories.stories import story_parts
 from copem_replay.extras.why.causes import Counterfactuals, name_cause, share_lateness
 from copem_replay.extras.why.triage import find_places, tabulate_episodes
-from copem_replay.report.figures.latency_breakdown import HIDDEN, IN_SIGHT, OUT_OF_VIEW, mean_stages
+from copem_replay.report.figures.latency_breakdown import HIDDEN, IN_SIGHT, LISTED, OUT_OF_VIEW, mean_stages
 from copem_replay.report.html.study import load_study
 from copem_replay.results.read import read_results
 from tests.helpers.recordings import Obj, pedestrian, write_recording
@@ -34,10 +35,18 @@ SAMPLES = ("tc016d", "crossing_units")
 RECORDINGS = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916", "ind_aah1")
 SEEN = ("rate", "outages", "missed", "memory")
 """Causes of an object in sight that is not listed."""
+AFTERWARDS = {
+    "way": ("processing", "queue", "latency", "ticks"), "lost": ("loss",),
+    "unmatched": ("fusion", "pose", "ghosts"), "unconfirmed": ("confirmation", "fusion"),
+}  # fmt: skip
+"""Causes of an object that is listed and not yet known."""
 
 
 class Part(NamedTuple):
-    """A time in which one thing is named: `out`, `hidden`, `seen` or `lists`; seconds after the onset, and by whom."""
+    """A time in which one thing is named: `out`, `hidden`, `seen`, `unlisted`, or one of `AFTERWARDS`.
+
+    Seconds after the onset, and by whom.
+    """
 
     what: str
     begin_s: float
@@ -51,7 +60,11 @@ def name_part(words: str) -> tuple[str, str]:
         return "hidden", hider[1]
     if re.match("out of range or view|no unit there", words):
         return "out", ""
-    return ("seen" if re.match("in sight, |seen by .*, not listed", words) else "lists"), ""
+    said = {
+        "seen by .*, not listed": "seen", "on its way": "way", "list lost": "lost", "unmatched": "unmatched",
+        "listed, not confirmed": "unconfirmed", "not listed": "unlisted", "known": "known",
+    }  # fmt: skip
+    return next(what for pattern, what in said.items() if re.match(pattern, words)), ""
 
 
 def read_lane(path: Path, who: str, number: int, onset_s: float, until_s: float) -> list[Part]:
@@ -119,13 +132,19 @@ pems:
     - {when: {range_m: [0, 20]}, detection: {kind: visible_share}}
     - {when: {range_m: [20, 50]}, detection: {kind: constant, probability: 1.0e-12}}
   short: [{when: {range_m: [0, 10]}, detection: {kind: visible_share}}]
+  sure: [{when: {range_m: [0, 20]}, detection: {kind: visible_share}}]
+links:
+  far: {reception: {kind: table, distance_m: [50, 50.001], probability: [1, 0]}, latency: {kind: constant, s: 0.5}}
 units:
   ego: {on: ego, height_m: 1.6, pem: eyes}
   mast: {at: [0, 80], height_m: 5.0, ground_z_m: 0.0, pem: short}
+  van: {on: "6", height_m: 2.5, pem: sure}
 configurations:
   now: {units: [ego]}
-  late: {units: [ego, mast], latency_s: 0.3}
+  late: {units: [ego, mast], latency_s: 0.5}
   mast: {units: [mast]}
+  radio: {units: [van], link: far}
+  ticks: {units: [ego], issue_hz: 0.5}
 measure:
   objects: {classes: [pedestrian]}
   onset: {kind: at, time_s: 0.0}
@@ -141,6 +160,22 @@ within range, where next to no draw lists it, and from 20 m on, at 4 s, every on
 at first and 20 m at .5 s. The mast, 80 m away, has none of them within its 10 m: what the ego has counts."""
 
 
+def wait(name: str, object_id: str) -> list[Part]:
+    """From the first list on until the object is known: latency, the next tick of 0.5 Hz, six lists of ten a second."""
+    since_s = BY_HAND[object_id][-1].end_s
+    tick_s = 2.0 * np.ceil(since_s / 2.0)
+    return {
+        "now": [], "late": [Part("way", since_s, since_s + 0.5)],
+        "confirmed": [Part("unconfirmed", since_s, since_s + 0.5)],
+        "ticks": [Part("way", since_s, tick_s)] if tick_s > since_s else [],
+    }[name]  # fmt: skip
+
+
+BY_RADIO = [Part("lost", 0.0, 1.5), Part("way", 1.5, 2.0)]
+"""The van, which comes at 10 m/s, lists pedestrian 7 from the first frame on; at 1.5 s it is nearer than 50 m to the
+ego (45 m ahead and 20 m aside: 49.2 m; at 1.4 s it is 50.1 m away), and what it sends arrives, half a second later."""
+
+
 @pytest.fixture(scope="module")
 def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("facts")
@@ -149,49 +184,63 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (0.1 * k, [
             Obj(id=1, x=0.0), pedestrian(2, 15.0), pedestrian(3, -60.0 + k, vx=10.0),
             pedestrian(4, 0.0, 21.0 - 0.2 * k, vy=-2.0), *([wide] if k <= 10 else []),
+            Obj(id=6, x=-20.0, y=-60.0 + k, vy=10.0), pedestrian(7, -24.0, -50.0),
         ])
         for k in range(51)
     ]  # fmt: skip
     write_recording(place / "drive.mcap", frames, host=1)
     (place / "e.yaml").write_text(TEXT)
+    (place / "confirmed.yaml").write_text(TEXT.replace("measure:\n", "measure:\n  confirm: {hits: 6, of: 6}\n"))
+    cr.run(place / "confirmed.yaml", jobs=1).save(place / "confirmed")
     return cr.run(place / "e.yaml", jobs=1).save(place / "results")
 
 
-@pytest.mark.parametrize("name", ["now", "late"])
-def test_by_hand(by_hand: Path, name: str) -> None:
-    results, late_s = read_results(by_hand), 0.3 if name == "late" else 0.0
-    table = results.detections.set_index(["configuration", "object_id"]).loc[name]
-    causes = read_causes(by_hand, [name])
-    for object_id, expected in BY_HAND.items():
-        row, until_s = table.loc[object_id], expected[-1].end_s
-        assert row["detection_s"] == pytest.approx(until_s + late_s)
-        assert [row["out_of_view_s"], row["hidden_s"]] == pytest.approx(
-            [sum_of(expected, k) for k in ("out", "hidden")]
-        )
-        number = ["now", "late", "mast"].index(name)
-        assert read_lane(by_hand / "replay.rrd", f"{object_id} pedestrian", number, 0.0, until_s) == [
-            Part(part.what, pytest.approx(part.begin_s), pytest.approx(part.end_s), part.by) for part in expected
-        ]
-        seconds = causes[object_id, name]
-        added = {cause: of for cause, of in seconds.items() if isinstance(of, float) and of > 1e-9}
-        whole = {"range": "out", "hidden": "hidden", "missed": "seen"}
-        by_cause = {cause: sum_of(expected, what) for cause, what in whole.items()}
-        by_cause |= {"latency": late_s, "unknown_s": until_s + late_s}
-        assert added == pytest.approx({cause: of for cause, of in by_cause.items() if of})
-        assert seconds["hidden_by"] == expected[0].by
-        stages = mean_stages(pd.DataFrame([row]), results.experiment, name)
-        found = [stages.get(stage, 0.0) for stage in (OUT_OF_VIEW, HIDDEN, IN_SIGHT)]
-        assert found == pytest.approx([sum_of(expected, what) for what in ("out", "hidden", "seen")])
+@pytest.mark.parametrize(
+    ("case", "object_id"), [*product(("now", "late", "ticks", "confirmed"), BY_HAND), ("radio", "7")]
+)
+def test_by_hand(by_hand: Path, case: str, object_id: str) -> None:
+    """`confirmed`: `now`, where six lists in a row are asked for."""
+    name, by_hand = ("now", by_hand.parent / "confirmed") if case == "confirmed" else (case, by_hand)
+    results = read_results(by_hand)
+    row = results.detections.set_index(["configuration", "object_id"]).loc[(name, object_id)]
+    before = [] if name == "radio" else BY_HAND[object_id]
+    expected = [*before, *(BY_RADIO if name == "radio" else wait(case, object_id))]
+    known_s = expected[-1].end_s
+    assert row["detection_s"] == pytest.approx(known_s)
+    assert [row["out_of_view_s"], row["hidden_s"]] == pytest.approx([sum_of(expected, k) for k in ("out", "hidden")])
+    number = list(results.experiment.configurations).index(name)
+    assert read_lane(by_hand / "replay.rrd", f"{object_id} pedestrian", number, 0.0, known_s) == [
+        Part(part.what, pytest.approx(part.begin_s), pytest.approx(part.end_s), part.by) for part in expected
+    ]
+    seconds = read_causes(by_hand, [name])[object_id, name]
+    added = {cause: of for cause, of in seconds.items() if isinstance(of, float) and of > 1e-9}
+    causes = {"out": "range", "hidden": "hidden", "seen": "missed", "lost": "loss", "unconfirmed": "confirmation"}
+    causes["way"] = "ticks" if name == "ticks" else "latency"
+    by_cause = {cause: sum_of(expected, what) for what, cause in causes.items()} | {"unknown_s": known_s}
+    assert added == pytest.approx({cause: of for cause, of in by_cause.items() if of})
+    assert seconds["hidden_by"] == expected[0].by
+    stages = mean_stages(pd.DataFrame([row]), results.experiment, name)
+    found = [stages.get(stage, 0.0) for stage in (OUT_OF_VIEW, HIDDEN, IN_SIGHT)]
+    # Without the columns of the way it is not known when it was first listed: not confirmed is in sight.
+    seen_s = sum_of(expected, "seen") + sum_of(expected, "unconfirmed")
+    assert found == pytest.approx([sum_of(expected, "out"), sum_of(expected, "hidden"), seen_s])
+    assert sum(stages.values()) == pytest.approx(known_s)
+    assert stages.get(LISTED, 0.0) >= sum_of(expected, "lost") - 1e-9
 
 
 def test_stories_by_hand(by_hand: Path) -> None:
-    """The mast never has any of them in view; it is the last one. Without it `late` is."""
+    """The mast never has any of them in view, the van only 7, which all others never have."""
     told = read_stories(by_hand)
+    assert told.pop("pedestrian 7") == {
+        "now": "out of range or view to the end, never known",
+        "radio": "list lost until 1.50 s, on its way from van until 2.00 s, known after 2.00 s, by the list of van, "
+        "which arrives 0.50 s late",
+    }
     assert {name: clauses["now"] for name, clauses in told.items()} == {
         "pedestrian 2": "behind car 5 (from ego) until 1.10 s, known after 1.10 s, by the ego's own list",
-        "pedestrian 3": "out of range or view until 1.00 s, in sight, not listed until 4.00 s, known after 4.00 s, "
+        "pedestrian 3": "out of range or view until 1.00 s, seen by ego, not listed until 4.00 s, known after 4.00 s, "
         "by the ego's own list",
-        "pedestrian 4": "in sight, not listed until 0.50 s, known after 0.50 s, by the ego's own list",
+        "pedestrian 4": "seen by ego, not listed until 0.50 s, known after 0.50 s, by the ego's own list",
     }
     assert {clauses["mast"] for clauses in told.values()} == {"out of range or view to the end, never known"}
 
@@ -221,22 +270,29 @@ def test_no_two_outputs_name_different_causes(name: str, tmp_path: Path) -> None
             row, why = table.loc[(one, object_id)], causes[object_id, one]
             row = row.iloc[0] if isinstance(row, pd.DataFrame) else row
             listed_s = np.nanmin([row.get("listed_s", np.nan), row["captured_s"], row["ended_s"]])
+            known_s = row["detection_s"] if row["detected"] else row["ended_s"]
             entity = f"{object_id} {row['object_class']}"
-            seen = read_lane(path, entity, shown.index(one), row["onset_s"], listed_s)
+            seen = read_lane(path, entity, shown.index(one), row["onset_s"], known_s)
             story = read_story(clause, row["ended_s"] - row["onset_s"])
             where = f"{name}, {who}, {one}: {seen}, {clause}, {why}"
-            for part in (part for part in seen if part.end_s - part.begin_s >= LEAST_S and part.what != "lists"):
+            for part in (part for part in seen if part.end_s - part.begin_s >= LEAST_S):
                 assert any(part.what == other.what and part.by == other.by for other in story), where
                 compared += 1
             for part in (part for part in story if part.end_s - part.begin_s >= LEAST_S):
                 assert any(part.what == other.what and part.by == other.by for other in seen), where
+            before = read_lane(path, entity, shown.index(one), row["onset_s"], listed_s)
             for what, cause, column in (("out", "range", "out_of_view_s"), ("hidden", "hidden", "hidden_s")):
                 assert abs(row[column] - why.get(cause, 0.0)) <= APART_S, where
-                assert abs(sum_of(seen, what) - row[column]) <= LEAST_S + APART_S, where
-            if sum_of(seen, "hidden") >= LEAST_S:
+                assert abs(sum_of(before, what) - row[column]) <= LEAST_S + APART_S, where
+            if sum_of(before, "hidden") >= LEAST_S:
                 assert why["hidden_by"] in {part.by for part in seen}, where
-            spent = sum_of(story, "seen")
+            spent = sum_of(before, "seen")
             if spent >= LEAST_S:
                 assert sum(why.get(cause, 0.0) for cause in SEEN) >= spent - LEAST_S, where
+            for what, possible in AFTERWARDS.items():
+                spent = sum_of(seen, what)
+                if spent >= LEAST_S:
+                    assert sum(why.get(cause, 0.0) for cause in possible) >= spent - LEAST_S, where
+                    assert known_s - listed_s >= spent - LEAST_S - APART_S, where
     assert told
     assert compared > 0 or name in ("tc016d", "nuscenes_scene0916"), "whose objects are in sight at once"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,7 +16,6 @@ import copem_replay as cr
 from copem_replay.core.errors import InputError
 from copem_replay.extras.stories import story_facts
 from copem_replay.extras.stories.stories import choose_stories, story_parts
-from copem_replay.extras.stories.story_facts import find_lost
 from copem_replay.extras.stories.story_pictures import place_words
 from copem_replay.report.figures import FIGURES, Selection
 from copem_replay.report.figures.paths import average_unknown, late_paths_figure, read_drive
@@ -56,7 +54,9 @@ def test_a_story_names_what_hides_and_who_listed_it(hidden: Path) -> None:
     [_, story] = story_parts(study)
     said = re.sub(r"<svg.*</svg>", "", story, flags=re.DOTALL)
     assert "late: behind car 9 (from ego) to the end, never known; " in said
-    assert "half: known after 0.30 s, by the list of mast, which arrives 0.30 s late." in said
+    assert (
+        "half: on its way from mast until 0.30 s, known after 0.30 s, by the list of mast, which arrives 0.30 s" in said
+    )
     assert "copem-replay view FOLDER --object 3" not in said, "no run is shown"
     assert 'viewBox="0 0 960 360"' in story
 
@@ -85,48 +85,34 @@ def test_stories_are_those_of_the_viewer(hidden: Path) -> None:
     assert [drive.scene.object_ids[k] for k in shown.object_ix] == ["3"]
 
 
-@pytest.mark.parametrize(("until_s", "expected"), [(1.0, 0), (1.4, 2), (3.0, 3)])
-def test_lists_that_the_radio_lost(until_s: float, expected: int) -> None:
-    """Five lists with object 0 at 1.0 … 1.4 s; lost are those at 1.1, 1.2 and 1.4 s, at 0.9 s one without it."""
-    captured_s = np.array([0.9, 1.0, 1.1, 1.2, 1.3, 1.4])
-    arrives_s = np.array([np.inf, 1.1, np.inf, np.inf, 1.4, np.inf])
-    lists = SimpleNamespace(
-        frame_ix=np.arange(6), row_object_ix=np.array([1, 0, 0, 0, 0, 0]), valid=np.ones((1, 6), dtype=bool),
-        captured_s=captured_s, common_arrives_s=arrives_s, frame_unit_ix=np.zeros(6, dtype=np.int64),
-    )  # fmt: skip
-    tracks: Any = SimpleNamespace(received=lists, by_link=np.ones(6, dtype=bool))
-    assert len(find_lost(tracks, 0, 0.0, until_s)) == expected
-    tracks.by_link[2] = False  # held back: never sent
-    assert len(find_lost(tracks, 0, 0.0, until_s)) == max(expected - 1, 0)
+LOSSY = "links: {lossy: {reception: {kind: constant, probability: 0.15}}}\nconfigurations:"
+LOST = ("configurations:", LOSSY), ("half: {units: [weak]}", "half: {units: [ego], link: lossy}")
 
 
-def test_the_sentence_counts_lists_that_the_radio_lost(tmp_path: Path) -> None:
+def test_lists_that_the_radio_loses_are_told(tmp_path: Path) -> None:
     """Of ten lists a second, all with the object, one in seven arrives: all before the one that counts are lost."""
-    link = "links: {lossy: {reception: {kind: constant, probability: 0.15}}}\nconfigurations:"
-    changes = ("configurations:", link), ("half: {units: [weak]}", "half: {units: [ego], link: lossy}")
-    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *changes, *ALONE))
+    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *LOST, *ALONE))
     (rows,) = read_results(folder).each(log="drive")
     [row] = rows[rows["run"] == 0].itertuples(index=False)
-    lost = round((row.captured_s - row.onset_s) / 0.1)
-    assert lost > 1
+    after_s = row.time_to_detection_s
+    assert after_s > 0.2
     words = Page(build_page(load_study(folder))).words
-    known = f"known after {row.time_to_detection_s:.2f} s, by the ego's own list"
-    assert f"half: listed from the onset on (the radio lost {lost} lists), {known}" in words
+    assert f"half: list lost until {after_s:.2f} s, known after {after_s:.2f} s, by the ego's own list" in words
 
 
-def test_lists_that_cannot_be_counted_are_not_said_to_be_late(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder from another kind of processor may come out otherwise: then nobody knows what became of the lists."""
+def test_what_became_of_lists_is_not_told_of_a_run_that_comes_out_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder from another kind of processor may: then nobody knows what became of the lists."""
 
     def differs(*_: object) -> NoReturn:
         raise InputError("run 0 comes out otherwise")
 
-    link = "links: {lossy: {reception: {kind: constant, probability: 0.15}}}\nconfigurations:"
-    changes = ("configurations:", link), ("half: {units: [weak]}", "half: {units: [ego], link: lossy}")
-    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *changes, *ALONE))
+    folder = replayed(tmp_path, changed(ONE, ("seed: 1", "seed: 4"), *LOST, *ALONE))
     monkeypatch.setattr(story_facts, "replay_again", differs)
     words = Page(build_page(load_study(folder))).words
-    assert "listed from the onset on (the first of these lists were lost, late or held back)" in words
-    assert "the radio lost" not in words
+    assert re.search(r"half: known after [0-9.]+ s, by the ego's own list", words)
+    assert "lost until" not in words
 
 
 def test_stories_are_in_the_report_and_without_the_recording_the_reason(tmp_path: Path) -> None:

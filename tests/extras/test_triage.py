@@ -9,8 +9,10 @@ import pytest
 
 from copem_replay.extras.why.causes import share_lateness
 from copem_replay.extras.why.triage import describe_episode, group_late_episodes
+from copem_replay.results.shown_objects import choose_shown_objects
 from tests.extras.test_causes import of_file
 from tests.helpers.experiments import drive
+from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 TEXT = """\
 version: 1
@@ -62,3 +64,44 @@ def test_in_time_is_not_late(tmp_path: Path) -> None:
     groups, episodes = triage(tmp_path, "", 55)
     assert len(groups) == 0
     assert episodes["unknown_s"].tolist() == pytest.approx([0.5])
+
+
+WALKERS = """\
+version: 1
+logs: [drive.mcap]
+pems: {sure: [{when: {range_m: [0, 10]}, detection: {kind: visible_share}}]}
+units: {ego: {on: ego, height_m: 1.8, pem: sure}}
+configurations: {alone: {units: [ego]}}
+measure: {objects: {classes: [pedestrian]}, onset: {kind: in_range, range_m: 30}, began: [crossed]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("walkers", "expected"),
+    [
+        ({2: (40, 1), 3: (55, 1)}, {"ahead": "3"}),
+        ({2: (40, 1), 3: (55, 1), 4: (40, -1)}, {"ahead": "3", "behind": ""}),
+        ({2: (40, 1), 4: (35, -1)}, {"ahead": "2", "behind": "4"}),
+    ],
+)
+def test_the_example_is_one_that_the_viewer_shows(
+    tmp_path: Path, walkers: dict[int, tuple[float, int]], expected: dict[str, str]
+) -> None:
+    """At 10 m/s one from 40 m is within 30 m after 1 s, too short after the begin to judge, one from 55 m after 2.5 s.
+
+    Seen from 10 m on they are known 2 s later. Where all are too short, some are shown all the same.
+    """
+    frames = [
+        (0.1 * k, [Obj(id=1, x=0.0), *(pedestrian(n, s * (d - k), 3.0, vx=-10.0 * s) for n, (d, s) in walkers.items())])
+        for k in range(70)
+    ]
+    write_recording(tmp_path / "drive.mcap", frames, host=1)
+    (tmp_path / "e.yaml").write_text(WALKERS)
+    replays = of_file(tmp_path / "e.yaml", "alone")
+    groups, _ = group_late_episodes(replays, share_lateness(replays))
+    assert dict(zip(groups["where"], groups["example"], strict=True)) == expected
+    scene, rows = replays.replay.scene, replays.rows
+    shown = choose_shown_objects(scene, replays.replay.truth, replays.only, rows[rows["run"] == 0])
+    ids = {scene.object_ids[k] for k in shown.object_ix}
+    assert {one for one in expected.values() if one} <= ids
+    assert ids == {*map(str, walkers)} - {*shown.too_short} or ids <= {*shown.too_short}

@@ -19,11 +19,10 @@ from copem_replay.io.recording import Recording, read_log
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.pipeline.sight import compute_sight
+from copem_replay.pipeline.sight import ABSENT, compute_sight
+from copem_replay.pipeline.status import EARLY, KNOWN, TOO_LATE, UNCONFIRMED, compute_status, read_episode_clocks
 from copem_replay.results.shown_objects import choose_shown_objects
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.sink import ABSENT, EARLY, KNOWN, TOO_LATE, UNCONFIRMED
-from copem_replay.viewer.status import compute_status, read_episode_clocks
 from tests.helpers.recordings import SHARED
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import SUMMARY, rows
@@ -99,9 +98,12 @@ def agrees(replay: Replay, wanted: Experiment, run: int, table: pd.DataFrame, sh
             episode = episodes.loc[replay.scene.object_ids[k]]
             time_s, status = of.elapsed_ns / 1e9, of.status[:, m]
             found |= set(status.tolist())
-            holding = fused.frame_ix[fused.valid[0] & (fused.row_object_ix == k)]
-            held = np.isin(newest, holding)
-            assert ((status >= EARLY) == held).all(), "nothing is listed without being one of these"
+            rows = np.flatnonzero(fused.valid[0] & (fused.row_object_ix == k))
+            held, onset_s = np.isin(newest, fused.frame_ix[rows]), episode["onset_s"] - 1e-6
+            since = run_tracks[name].captured_s[0, rows] >= (-np.inf if wanted.measure.count_earlier else onset_s)
+            counts = held & ((time_s < onset_s) | np.isin(newest, fused.frame_ix[rows[since]]) | (status == KNOWN))
+            assert ((status >= EARLY) == counts).all(), "nothing is listed without being one of these"
+            assert EARLY not in status[time_s >= onset_s]
             if episode["detected"]:
                 assert ((status == KNOWN) == (held & (time_s >= episode["detection_s"] - 1e-9))).all()
                 assert (status[np.abs(time_s - episode["detection_s"]) < 1e-9] == KNOWN).any()
@@ -210,18 +212,18 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
     assert lane(path, "2 pedestrian", 0) == [
         (0, "on its way from ego"),
-        (0.5, "old list"),
+        (0.5, "listed before the onset"),
         (pytest.approx(0.95, abs=0.05), "onset"),
         (pytest.approx(0.975, abs=0.025), "onset of the object"),
-        (1, "old list"),
+        (1, "on its way from ego"),
         (1.5, "known"),
     ]
     assert told(path, "late", 0.9)[0] == "2 listed, 0.5 s old"
-    assert told(path, "late", 1.0)[0] == "2 listed, 0.5 s old, from before the onset"
-    assert told(path, "late", 1.45)[0] == "2 listed, 0.5 s old, from before the onset"
+    assert told(path, "late", 1.0)[0] == "2 listed by ego, arrives in 0.5 s"
+    assert told(path, "late", 1.45)[0] == "2 listed by ego, arrives in 0.1 s"
     assert told(path, "late", 1.5)[0] == "2 known, 0.5 s old"
     assert labels(path, "late", 0.9) == ["2 listed"]
-    assert labels(path, "late", 1.2) == ["2 only in old list"]
+    assert labels(path, "late", 1.2) == ["2 on its way"]
     counted = [(row["elapsed"], row["Scalars:scalars"][0]) for row in rows(path, "/plots/known/late")]
     assert [count for elapsed, count in counted if elapsed < 1.55e9] == [0, 1]
 

@@ -11,6 +11,7 @@ import pytest
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.results.shown_objects import choose_shown_objects, find_opening_s
+from copem_replay.viewer.events import _describe_others
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import make, static
 
@@ -137,9 +138,20 @@ def test_what_is_too_short_is_listed(tmp_path: Path) -> None:
     )
     made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
     [text] = static(made.path, "/difference")["TextDocument:text"]
-    assert "Too short to judge: 8." in text
+    assert "Shown: 1 of 2 that count.\n\nToo short to judge: 8." in text
     assert "7 car" in text
     assert "8 car" not in text
+
+
+def test_who_is_never_known_is_said_though_not_shown() -> None:
+    """As many as titles count: here three, of whom x never knows the second, and nobody the third."""
+    replay, _ = ready(**PLACES)
+    rows = table(("near", 2.0, 9.0, 3.0, 4.0), ("beside", 2.0, 9.0, None, 3.0), ("far", 2.0, 9.0, None, None))
+    rows = rows[rows["configuration"] != "GT"]
+    number = replay.scene.object_number
+    [line] = _describe_others(rows, replay.scene, {number["near"]: ""})
+    assert line == "Shown: 1 of 3 that count. Of the others never known: beside with x, far."
+    assert list(_describe_others(rows, replay.scene, {number[name]: "" for name in ("near", "beside", "far")})) == []
 
 
 def test_what_is_shown_all_the_same_is_said_to_be_too_short(tmp_path: Path) -> None:

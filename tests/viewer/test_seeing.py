@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,26 @@ from hypothesis import strategies as st
 from copem_replay.core.colours import TRUTH, configuration_colours
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recording import read_log
+from copem_replay.perception.sight import HIDDEN
 from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.one_run import tracks_of_run
 from copem_replay.pipeline.prepare import prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.pipeline.sight import STEADY_S, smooth_status
+from copem_replay.pipeline.sight import ABSENT, STEADY_S, smooth_status
+from copem_replay.pipeline.status import EARLY, KNOWN, STATUSES
 from copem_replay.results.shown_objects import axis_s, choose_shown_objects
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
 from copem_replay.viewer.camera import camera_following, camera_on_ego, include_places
 from copem_replay.viewer.curves import break_lines, running_median
-from copem_replay.viewer.lanes import lanes_axis_s
+from copem_replay.viewer.lanes import _shorten_words, lanes_axis_s
 from copem_replay.viewer.sensors import watching_places
-from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, STATUSES, show_seconds
+from copem_replay.viewer.sink import show_seconds
 from tests.helpers.report_pages import named
-from tests.oracles.colour import apart_for_a_deuteranope, contrast
+from tests.helpers.scenes import Thing, recording, standing
+from tests.oracles.colour import apart_for_a_deuteranope, ciede2000, contrast, lab, linear
 from tests.viewer.test_camera import corners, origins, picture
-from tests.viewer.test_rrd import SUMMARY, Made, rows, static
+from tests.viewer.test_rrd import SUMMARY, Made, make, rows, static
 from tests.viewer.test_status import lane
 
 ROOT = Path(__file__).parents[2]
@@ -130,6 +133,18 @@ def test_statuses_stay_apart_for_deuteranopes() -> None:
     assert apart_for_a_deuteranope((0, 0, 0), (255, 255, 255)) == pytest.approx(100, abs=0.1)
     assert contrast((0, 0, 0), (255, 255, 255)) == pytest.approx(21)
     assert apart_for_a_deuteranope((170, 80, 0), (110, 110, 0)) < 15
+
+
+def test_what_is_listed_looks_like_no_other_status() -> None:
+    """In lanes of both themes, where 200 of 255 of a colour lie on black or white: ΔE2000 of 10 and more."""
+    listed = [palette.status_colour(EARLY, c) for c in configuration_colours(map(str, range(8)), ()).values()]
+    for ground in (0, 255):
+        lanes = {
+            colour: lab(linear(tuple(round((200 * channel + 55 * ground) / 255) for channel in colour)))
+            for colour in (*listed, *palette.STATUS.values())
+        }
+        for one, other in product(listed, palette.STATUS.values()):
+            assert ciede2000(lanes[one], lanes[other]) >= 10, (one, other, ground)
 
 
 def test_marks_of_differences_use_no_colour_of_a_configuration() -> None:
@@ -301,6 +316,42 @@ def test_words_of_lanes_fit_into_their_spans(city: Made) -> None:
             assert not label or 7 * len(label) + 10 <= 380 * lasts_s / (axis[1] - axis[0]) + 1e-3, label
         told += len([label for _, label in shown if label])
     assert told > 48, "names, and when each is known"
+
+
+def test_a_long_name_is_cut_and_not_left_out(tmp_path: Path) -> None:
+    """The pedestrian is there from 2 s on: nothing is before the log's start, so there is no room for all letters."""
+    names = ["the_first_results:a_configuration_of_the_ego_alone", "the_newer_results:a_configuration_of_the_ego_late"]
+    scene = recording(
+        [Thing("ego", "car", standing(0, 0)), Thing("2", "pedestrian", standing(20, 0), there=lambda t: t > 1.95)],
+        until_s=6.0,
+    )
+    asked = {name: {"units": ["ego"], "latency_s": late_s} for name, late_s in zip(names, (0.0, 0.5), strict=True)}
+    made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}}, configurations=asked)
+    labels = [
+        batch.column("StateConfiguration:labels").to_pylist()[0]
+        for entity, batch in batches(made.path)
+        if entity.startswith("/lanes/2_") and "StateConfiguration:labels" in batch.schema.names
+    ]
+    assert len(labels) == 2
+    for name, of_lane in zip(names, labels, strict=True):
+        [cut] = [label for label in of_lane if "…" in label]
+        begin, end = cut.split("…")
+        assert name.startswith(begin)
+        assert name.endswith(end)
+        assert min(len(begin), len(end)) >= 3
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("seen by roadside, not listed", ["not listed", "seen"]), ("out of range or view", ["out of view", "out"]),
+        ("on its way from ego", ["on its way", "on way"]), ("listed, not confirmed", ["not confirmed", "listed"]),
+        ("behind car 3 (from ego)", ["behind car 3", "behind 3", "behind"]), ("list lost", ["lost"]),
+        ("not listed", []), ("7 lost", []), ("0.50 s known", ["0.50 s"]), ("PEM: seen by ego, not listed", ["PEM"]),
+    ],
+)  # fmt: skip
+def test_words_are_shortened_to_what_is_still_true(text: str, words: list[str]) -> None:
+    assert list(dict.fromkeys(_shorten_words(text))) == [text, *words]
 
 
 def test_the_overview_has_the_table_that_fits(city: Made) -> None:

@@ -106,6 +106,19 @@ def test_two_folders_beside_each_other(call: Compare, tmp_path: Path) -> None:
     (told,) = rows(path, r"/events/difference/a\:GT")
     assert told["TextLog:text"] == ["a:GT knew 2 car as soon as b:PEM"]
 
+    # Opened without `view` it plays from the difference on: the viewer cannot be told of an instant.
+    from rerun.chunk import RrdReader
+
+    [blueprint] = RrdReader(path).blueprints()
+    panel = {
+        name: batch.column(name).to_pylist()[0]
+        for batch in (chunk.to_record_batch() for chunk in RrdReader(path).stream(store=blueprint))
+        for name in batch.schema.names
+        if name.startswith("TimePanelBlueprint:")
+    }
+    assert panel["TimePanelBlueprint:time_selection"][0]["min"] == 1_250_000_000, "between 1 and 1.5 s"
+    assert panel["TimePanelBlueprint:play_state"] == [2], "playing"
+
     # Both call their unit `ego` and mean different ones; the masts see as far as the egos, so they differ as well.
     units = {entity.removeprefix("/world/units/") for entity in entities if entity.startswith("/world/units/")}
     assert {unit.replace("\\", "") for unit in units} == {"ego", "mast", "a:ego", "a:mast"}

@@ -15,7 +15,8 @@ import pytest
 
 from copem_replay.core.colours import configuration_colours
 from copem_replay.core.tracks import Solid
-from copem_replay.viewer.sink import STATUSES, slice_by_frame, split_into_files
+from copem_replay.pipeline.status import STATUSES
+from copem_replay.viewer.sink import slice_by_frame, split_into_files
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, recording, standing
 from tests.viewer.test_line_of_sight import PERSON, SECTOR, WALL, lines
 from tests.viewer.test_rrd import SUMMARY, Made, at, chunks, make, rows, static
@@ -417,8 +418,7 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     from dataclasses import replace
 
     from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.viewer.sink import CAPTURED, KNOWN, LOST
-    from copem_replay.viewer.status import compute_status, read_episode_clocks
+    from copem_replay.pipeline.status import KNOWN, LOST, UNDER_WAY, compute_status, read_episode_clocks
 
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
@@ -435,7 +435,26 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     early = made.elapsed_ns < 450_000_000
     assert set(made.status[early, 0].tolist()) == {LOST}
     assert set(made.status[~early, 0].tolist()) == {KNOWN}
-    assert CAPTURED not in made.status
+    assert UNDER_WAY not in made.status
+
+
+def test_a_list_that_arrives_after_the_last_fused_one_is_on_its_way(hiding: Made) -> None:
+    from dataclasses import replace
+
+    from copem_replay.pipeline.sight import compute_sight
+    from copem_replay.pipeline.status import UNDER_WAY, compute_status, read_episode_clocks
+
+    tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
+    received = replace(tracks.received, arrives_s=tracks.received.captured_s[None] + 10.0)
+    nothing = replace(tracks.fused, valid=np.zeros_like(tracks.fused.valid))
+    seen = compute_sight(hiding.replay, hiding.given, [number])
+    clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
+    made = compute_status(
+        hiding.replay, hiding.given, "both", replace(tracks, received=received, fused=nothing), seen, clock
+    )
+    there = made.elapsed_ns < 2_000_000_000
+    assert set(made.status[there, 0].tolist()) == {UNDER_WAY}
+    assert made.until_s[0, 0] == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("arrives", [False, True])
@@ -444,8 +463,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     from dataclasses import replace
 
     from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.viewer.sink import LOST, UNMATCHED, VISIBLE
-    from copem_replay.viewer.status import compute_status, read_episode_clocks
+    from copem_replay.pipeline.status import IN_SIGHT, LOST, UNMATCHED, compute_status, read_episode_clocks
 
     fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
     received = fused_tracks.received
@@ -461,7 +479,7 @@ def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hi
     )
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
-    assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[VISIBLE]}
+    assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[IN_SIGHT]}
 
 
 def test_nothing_that_is_written_is_nan(hiding: Made) -> None:

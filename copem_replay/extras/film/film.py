@@ -26,22 +26,26 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, TRUTH, Bool, Float, Int
 from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.perception.sight import HIDDEN
 from copem_replay.perception.visibility import rectangle_corners
 from copem_replay.pipeline.one_run import ReplayedRun
-from copem_replay.pipeline.sight import Sight, compute_sight
-from copem_replay.report.figures.selection import Selection, choose_object_and_run
-from copem_replay.report.figures.style import find_truths
-from copem_replay.results.again import replay_again
-from copem_replay.results.outputs import check_output, made_file
-from copem_replay.viewer.sink import ABSENT, HIDDEN, KNOWN, elapsed_ns, short_ids, to_nanoseconds
-from copem_replay.viewer.status import (
+from copem_replay.pipeline.sight import ABSENT, Sight, compute_sight
+from copem_replay.pipeline.status import (
+    KNOWN,
     NEVER_NS,
     EpisodeClocks,
     Status,
     compute_status,
-    explain_status,
+    elapsed_ns,
     read_episode_clocks,
+    to_nanoseconds,
 )
+from copem_replay.report.figures.selection import Selection, choose_object_and_run
+from copem_replay.report.figures.style import find_truths
+from copem_replay.results.again import replay_again
+from copem_replay.results.outputs import check_output, made_file
+from copem_replay.viewer.sink import short_ids
+from copem_replay.viewer.status import explain_status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -268,10 +272,8 @@ def _choose_words(
     """The words (T,) on the object at rows (T,) of its statuses: “behind 41”, “known 0.60 s after the onset”."""
     scene, object_ix = replayed.replay.scene, int(sight.object_ix[0])
     onset_ns, known_ns = int(clock.onset_ns[object_ix]), int(clock.known_ns[object_ix])
-    started = statuses.elapsed_ns[rows] >= onset_ns
-    reasons = explain_status(
-        scene, replayed.experiment, sight, statuses, rows, np.zeros(len(rows), dtype=np.int64), started
-    )
+    column = np.zeros(len(rows), dtype=np.int64)
+    reasons = explain_status(scene, replayed.experiment, sight, statuses, rows, column)
     after_s = (known_ns - onset_ns) * 1e-9 if NEVER_NS not in (known_ns, onset_ns) else 0.0
     told = {
         ABSENT: "absent",

@@ -28,6 +28,7 @@ from copem_replay.extras.fitting.fit import (
 from copem_replay.extras.fitting.gather import Gathered
 from copem_replay.extras.fitting.rows import FitLists, FitRows
 from copem_replay.io.recording import Recording
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.pipeline.study_log import compute_log_digests
 from copem_replay.report.figures.style import format_three_digits
 from copem_replay.report.html.markup import Html, allow_breaks, join_html, make_list, make_table, make_tag
@@ -43,7 +44,6 @@ from copem_replay.viewer.sink import (
     file_stream,
     plain_part,
     stack_float32,
-    to_nanoseconds,
 )
 
 if TYPE_CHECKING:

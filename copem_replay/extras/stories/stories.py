@@ -12,7 +12,6 @@ from copem_replay.core.errors import RecordingError
 from copem_replay.core.tracks import SAME_INSTANT_S
 from copem_replay.extras.stories.story_facts import (
     ObjectStory,
-    count_lost_lists,
     explain_story,
     find_spans,
     format_seconds,
@@ -48,7 +47,7 @@ def story_parts(study: ReportData) -> list[Html]:
         return [make_tag("p", f"No plans of {log}: {NO_RECORDING}.")]
     chosen, too_short = choose_stories(drive, table, rows)
     told = {name: first_episodes(rows[rows["object_id"] == name]) for name in chosen}
-    spans, lost = find_spans(study, drive, run, told), count_lost_lists(study, drive, run, told)
+    spans = find_spans(study, drive, run, told)
     said = (
         f"Run {run} of {log}: the objects that copem-replay view shows. First are those that configurations know at "
         "the most different times, near the way of the ego."
@@ -58,8 +57,7 @@ def story_parts(study: ReportData) -> list[Html]:
     short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
     for name, of in told.items():
-        story = ObjectStory(study, drive, of, spans[name], None if lost is None else lost.get(name, {}))
-        parts.append(_story_element(story))
+        parts.append(_story_element(ObjectStory(study, drive, of, spans[name])))
     return parts
 
 

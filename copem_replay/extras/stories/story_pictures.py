@@ -12,12 +12,12 @@ from copem_replay.core.tracks import SAME_INSTANT_S, Float, Tracks
 from copem_replay.extras.stories.story_facts import (
     ObjectStory,
     format_seconds,
-    listed_until_s,
     unit_pose,
     world_at,
 )
+from copem_replay.perception.sight import HIDDEN, IN_SIGHT
 from copem_replay.perception.visibility import box_corners
-from copem_replay.pipeline.sight import SightSpan
+from copem_replay.pipeline.sight import StatusSpan
 from copem_replay.report.figures.selection import pick_evenly
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
 
@@ -37,7 +37,7 @@ _MARGIN_M = 6.0
 """Bodies whose middle is so far outside a plan may still reach into it."""
 
 
-def draw_story(story: ObjectStory, hider: SightSpan | None, said: str) -> Html:
+def draw_story(story: ObjectStory, hider: StatusSpan | None, said: str) -> Html:
     """The picture of a story; `said`: its sentence, for screen readers."""
     picture = make_tag(
         "svg", *_draw_plans(story, hider), *_draw_lanes(story), class_="story", role="img", aria_label=said,
@@ -61,7 +61,7 @@ class _View:
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _draw_plans(story: ObjectStory, hider: SightSpan | None) -> Iterator[Html]:
+def _draw_plans(story: ObjectStory, hider: StatusSpan | None) -> Iterator[Html]:
     first, last = story.first, story.last
     short = story.short
     known = (
@@ -87,7 +87,7 @@ def _draw_plans(story: ObjectStory, hider: SightSpan | None) -> Iterator[Html]:
         yield make_tag("rect", **frame, fill="none", stroke="#8c8c8c")
 
 
-def _choose_box(story: ObjectStory, worlds: Sequence[Tracks], hider: SightSpan | None) -> tuple[float, float, float]:
+def _choose_box(story: ObjectStory, worlds: Sequence[Tracks], hider: StatusSpan | None) -> tuple[float, float, float]:
     """West and north end (m) and width (m) of the plans: the object, what hides it, and the ego, if it is near."""
     drive, number = story.drive, story.drive.scene.object_number[story.object_id]
     own = np.concatenate([_places(world, number) for world in worlds])
@@ -110,7 +110,7 @@ def _places(world: Tracks, object_ix: int) -> Float:
     return np.stack([world.x_m[0, rows], world.y_m[0, rows]], axis=-1)
 
 
-def _draw_plan(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: SightSpan | None) -> Iterator[Html]:
+def _draw_plan(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: StatusSpan | None) -> Iterator[Html]:
     """Boxes of all bodies, obstacles, units, and the line of who lists it, at the onset of who does not see it."""
     drive, scene = story.drive, story.drive.scene
     yield make_tag("rect", x=f"{view.left}", y=f"{_TOP}", width=f"{_PLAN_W}", height=f"{_PLAN_H}", fill="#f7f7f7")
@@ -167,7 +167,7 @@ def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tu
         yield name, *spots[k]
 
 
-def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: SightSpan | None) -> Iterator[Html]:
+def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: StatusSpan | None) -> Iterator[Html]:
     """Masts, and a line from the unit that lists the object, at the onset from one from which it is hidden then."""
     drive = story.drive
     for at in drive.fixed_units().values():
@@ -190,9 +190,8 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider:
 
 # Lanes: a row per configuration, the soonest first.
 
-_SHADES = {"out of range or view": "#4d4d4d", "hidden": "#808080", "in sight": "#bfbfbf", "on its way": "#e0e0e0"}
-_STATE_SHADES = (*list(_SHADES.values())[:1], *list(_SHADES.values())[:3])
-"""By state of a span; where there is no unit, as out of view."""
+_OUT, _HIDDEN, _IN_SIGHT, _LISTED = "#4d4d4d", "#808080", "#bfbfbf", "#e0e0e0"
+_SHADES = {"out of range or view": _OUT, "hidden": _HIDDEN, "in sight": _IN_SIGHT, "listed": _LISTED}
 
 
 def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
@@ -219,17 +218,15 @@ def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: flo
     Known is thicker: some configurations are as grey as what is before.
     """
     known_s, name = story.known_s(row), str(row["configuration"])
-    listed_s, until_s = min(listed_until_s(row), known_s), known_s if row["detected"] else story.onset_s
-    spans = [(span.begin_s, min(span.end_s, known_s), _STATE_SHADES[span.state]) for span in story.spans[name]]
-    spans.append((listed_s, until_s, _SHADES["on its way"]))
+    shades = {HIDDEN: _HIDDEN, IN_SIGHT: _IN_SIGHT}
     thin, thick = ({"y": f"{y + (height - high) / 2:.1f}", "height": f"{high:.1f}"} for high in (height / 2, height))
     yield make_tag(
         "text", story.short[name], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"
     )
-    for begin_s, end_s, shade in spans:
-        if end_s > begin_s:
-            x, width = _LANE_LEFT + (begin_s - story.onset_s) * scale, (end_s - begin_s) * scale
-            yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=shade, **thin)
+    for span in story.spans.get(name, ()):
+        x, width = _LANE_LEFT + (span.begin_s - story.onset_s) * scale, (span.end_s - span.begin_s) * scale
+        shade = shades.get(span.status, _LISTED if span.status > IN_SIGHT else _OUT)
+        yield make_tag("rect", x=f"{x:.1f}", width=f"{width:.1f}", fill=shade, **thin)
     x = _LANE_LEFT + max(known_s - story.onset_s, 0.0) * scale
     if row["detected"]:
         look = story.study.looks[name]

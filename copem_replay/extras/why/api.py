@@ -325,22 +325,23 @@ def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[s
 
 def _describe_groups(name: str, groups: pd.DataFrame) -> list[str]:
     from copem_replay.extras.why.causes import describe_cause
-    from copem_replay.extras.why.triage import describe_structure
+    from copem_replay.extras.why.triage import TOO_SHORT, describe_structure
 
     lost_s, lines = groups["lost_s"].sum(), list[str]()
     for row in groups.head(_SHOWN_GROUPS).itertuples():
         where = f" ({row.where})" if row.where else ""
         objects, cause = count_noun(int(row.objects), "object"), describe_cause(str(row.cause))
         how = describe_structure(float(row.structural_share))
-        lines.append(
-            f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}{how}; "
-            f"such as {row.example_class} {row.example} at {row.example_onset_s:.1f} s"
-        )
-    rest, first = len(groups) - _SHOWN_GROUPS, groups.iloc[0]
+        such = f"such as {row.example_class} {row.example} at {row.example_onset_s:.1f} s" if row.example else TOO_SHORT
+        lines.append(f"{row.log}: {objects}, {row.lost_s:.1f} s, {cause}{where}{how}; {such}")
+    rest, shown = len(groups) - _SHOWN_GROUPS, groups[groups["example"] != ""]
     more = [f"and {count_noun(rest, 'group')} more in triage.csv"] if rest > 0 else []
-    look = f"look at one in results: copem-replay view FOLDER --object {first['example']} --log {first['log']}"
+    more += [
+        f"look at one in results: copem-replay view FOLDER --object {first.example} --log {first.log}"
+        for first in shown.head(1).itertuples()
+    ]
     head = f"{name}: late for more than 1 s, {lost_s:.1f} s in {count_noun(len(groups), 'group')}"
-    return [head, *lines, *more, look]
+    return [head, *lines, *more]
 
 
 def _describe_hopeless(late: pd.DataFrame) -> Iterator[list[str]]:

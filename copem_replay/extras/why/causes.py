@@ -191,7 +191,7 @@ RECORDED = "recorded"
 """What is left of a configuration with recorded units: what these list, and when, is as it was recorded."""
 LEFT = {
     NO_UNIT: Cause(NO_UNIT, NO_UNIT, NO_UNIT, lambda e: e),
-    RECORDED: Cause(RECORDED, RECORDED, "not in a recorded list", lambda e: e),
+    RECORDED: Cause(RECORDED, RECORDED, "as it was recorded", lambda e: e),
 }
 """What is left without any cause."""
 _ORDER = (*LEFT.values(), *CAUSES)

@@ -11,7 +11,7 @@ import pandas as pd
 from copem_replay.core.errors import count_noun
 from copem_replay.extras.why.causes import CAUSES, describe_cause
 from copem_replay.extras.why.sensitivity import compare_orders, describe_orders, tabulate_variations
-from copem_replay.extras.why.triage import describe_structure
+from copem_replay.extras.why.triage import TOO_SHORT, describe_structure
 from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
     Html,
@@ -136,10 +136,11 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
         words = (
             f"{row['log']}: {objects}, {float(row['lost_s']):.1f} s ({share} %), {describe_cause(str(row['cause']))}"
         )
-        example = f"copem-replay view FOLDER --object {row['example']} --log {row['log']}"
         words += where + describe_structure(float(row["structural_share"]))
         story = link_story(str(row["log"]), str(row["example"]), f"{row['example_class']} {row['example']}")
-        lines.append(make_tag("span", f"{words}; such as ", story, " ", make_tag("code", example)))
+        view = make_tag("code", f"copem-replay view FOLDER --object {row['example']} --log {row['log']}")
+        such = ["such as ", story, " ", view] if row["example"] else [TOO_SHORT]
+        lines.append(make_tag("span", f"{words}; ", *such))
     rest = len(of) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []
     head = make_tag("p", f"{name}: late for more than 1 s, {lost_s:.1f} s in all")

@@ -10,7 +10,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.extras.why.api import VISIBLE_S, Explanation
 from copem_replay.extras.why.causes import describe_cause
 from copem_replay.extras.why.sensitivity import AS_IT_IS, describe_orders
-from copem_replay.extras.why.triage import LATE_S, describe_structure
+from copem_replay.extras.why.triage import LATE_S, TOO_SHORT, describe_structure
 
 _MOST_ROWS = 12
 """Configurations in the table; more are in `why.csv`."""
@@ -79,14 +79,18 @@ def _tell_late(groups: pd.DataFrame, folder: str, *, of_one: bool) -> list[str]:
         return [f"No object is unknown for more than {LATE_S:g} s in 5 % of the runs or more."]
     worst = groups.loc[groups["lost_s"].idxmax()]
     where = f" ({worst['where']})" if worst["where"] else ""
-    told = f"{worst['example_class']} {worst['example']}"
-    if int(worst["objects"]) > 1:
-        told = f"{count_noun(int(worst['objects']), 'object')} such as {told}"
+    named, count = f"{worst['example_class']} {worst['example']}", int(worst["objects"])
+    told = f"{count_noun(count, 'object')} such as {named}" if count > 1 else named
+    told = told if worst["example"] else f"{count_noun(count, 'object')}, {TOO_SHORT}"
+    shown = groups[groups["example"] != ""].sort_values("lost_s", ascending=False, kind="stable").head(1)
     how = describe_structure(float(worst["structural_share"]))
     return [
         f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {told}: "
         f"{describe_cause(str(worst['cause']))}{where}{how}.",
-        f"    copem-replay view {folder} --object {worst['example']}" + ("" if of_one else f" --log {worst['log']}"),
+        *(
+            f"    copem-replay view {folder} --object {row.example}" + ("" if of_one else f" --log {row.log}")
+            for row in shown.itertuples()
+        ),
     ]
 
 

@@ -18,9 +18,12 @@ from copem_replay.extras.why.causes import CAUSES, LEFT, CauseShares, Counterfac
 from copem_replay.perception.sight import HIDDEN
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import compute_sight, list_sight_spans
+from copem_replay.results.shown_objects import is_observed
 
 LATE_S = 1.0
 """An episode that is unknown for longer is late: on fourteen recorded drives, four fifths of all seconds."""
+TOO_SHORT = "all too short to judge"
+"""Of a group without an object that viewers show."""
 _MOST_LATE = 0.05
 """Episodes that are late in a larger share of the runs are in the groups."""
 _HELPED = ("hidden", "rate", "outages", "range", "missed", "memory", "fusion", "pose", "ghosts")
@@ -65,13 +68,15 @@ def group_late_episodes(
     episodes[["where", "hidden_by"]] = ""
     if is_late.any():
         episodes.loc[is_late, ["where", "hidden_by"]] = find_places(replays.replay, episodes[is_late])
-    grouped = []
+    grouped, none_is = [], not is_observed(episodes).any()  # then some are shown all the same
     for (log, cause, where), of in episodes[is_late].groupby(["log", "cause", "where"], sort=False):
-        worst = of.loc[of["unknown_s"].idxmax()]
+        judged = of[is_observed(of) | none_is]
+        worst = of.loc[(judged if len(judged) else of)["unknown_s"].idxmax()]
         grouped.append({
             "log": log, "cause": cause, "where": where, "episodes": len(of), "objects": of["object_id"].nunique(),
             "lost_s": of["unknown_s"].sum(), "never_share": of["never_share"].mean(),
-            "structural_share": _share_structural(of["structural_share"]), "example": worst["object_id"],
+            "structural_share": _share_structural(of["structural_share"]),
+            "example": worst["object_id"] if len(judged) else "",
             "example_class": worst["object_class"], "example_onset_s": worst["onset_s"],
         })  # fmt: skip
     return rank_groups(pd.DataFrame(grouped, columns=COLUMNS)), episodes
@@ -126,7 +131,7 @@ def _find_bodies(replay: Replay, objects: Int, begin_s: Float, until_s: Float) -
     for k, *between_s in zip(objects.tolist(), begin_s.tolist(), until_s.tolist(), strict=True):
         lasts_s: dict[str, float] = {}
         for span in list_sight_spans(replay, sight, shown.index(k), names, *between_s):
-            if span.state == HIDDEN:
+            if span.status == HIDDEN:
                 lasts_s[span.body] = lasts_s.get(span.body, 0.0) + span.end_s - span.begin_s
         words.append(max(lasts_s, key=lambda body: lasts_s[body], default=""))
     return words
