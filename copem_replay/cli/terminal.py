@@ -10,6 +10,7 @@ import sys
 import time
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
@@ -156,15 +157,16 @@ def print_notes(lines: Iterable[str]) -> None:
 
 
 MOST_NOTES = 4
-"""More lines are not read."""
+"""Lines of notes: more are not read."""
 
 
 def print_first_notes(lines: Sequence[str], *, explain: bool) -> None:
-    """Print the first notes on stderr, and how many others there are; all of them with `explain`."""
-    most = len(lines) if explain else MOST_NOTES
-    print_notes(lines[:most])
-    if len(lines) > most:
-        print_problems([f"and {count_noun(len(lines) - most, 'more note')}: --explain"])
+    """Print the first notes on stderr, one at least, and how many others there are; all of them with `explain`."""
+    ends = accumulate(len(wrap_line(f"note: {line}", width_of(sys.stderr))) for line in lines)
+    shown = len(lines) if explain else max(1, sum(end <= MOST_NOTES for end in ends))
+    print_notes(lines[:shown])
+    if (more := len(lines) - shown) > 0:
+        print_problems([f"and {count_noun(more, 'more note')}: --explain"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

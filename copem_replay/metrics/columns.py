@@ -367,7 +367,8 @@ _PROVENANCE = (
     Column("configurations", "by name",
            "what each configuration is: the `truth`, `recorded`, `by_truth_id`, `fixed` (equal in every run) and "
            "`fixed_verdicts`, `needs_visibility` (of its onset), its `ideal`, ideal fusion of its inputs or units "
-           "(`ideal_of`), and `remembering`, the one with memory that its accuracy is held against"),
+           "(`ideal_of`), `remembering`, the one with memory that its accuracy is held against, `least_s`, below which "
+           "no time to detection is"),
     Column("run_shown", "by name", "by log the number of the run in `replay.mcap`"),
     Column("runs_shown", "by name",
            "by log every run that is written: `file`, `run`, and `run_is`, why it is this one"),

@@ -58,6 +58,7 @@ CLUSTERS = {
              "how far other draws of the same models may differ for this one object; nothing about other traffic"),
 }  # fmt: skip
 """Words for what intervals are over: of one, whose, and what they tell."""
+_OF_DRIVING = "run", " of the driving", "how far other draws of the same models may differ; nothing about other drives"
 TRAFFIC = ("logs", "objects", "passes")
 """What intervals that tell of more than other draws are over."""
 
@@ -192,12 +193,13 @@ def find_clusters(table: pd.DataFrame, *, of_runs: bool = False, weigh: str = OB
     return Clusters(over, number, one if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
 
 
-def describe_clusters(over: str, number: int | None = None, fewest: int | None = None) -> str:
+def describe_clusters(over: str, number: int | None = None, fewest: int | None = None, driving: bool = False) -> str:
     """What an interval is over, and what it tells: `8 logs: how far other drives of this kind may differ`.
 
-    `fewest`: where intervals are over different numbers of clusters, up to `number`.
+    `fewest`: where intervals are over different numbers of clusters, up to `number`. `driving`: of the ego's
+    driving, not of objects.
     """
-    noun, whose, tells = CLUSTERS[over]
+    noun, whose, tells = _OF_DRIVING if driving and over == "runs" else CLUSTERS[over]
     counted = over if number is None else count_noun(number, noun, over)
     up_to = "" if fewest is None or fewest == number else f"{fewest} to "
     return f"{up_to}{counted}{whose}: {tells}"

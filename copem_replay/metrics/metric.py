@@ -9,7 +9,7 @@ of lists on links (`LINK`) and of recorded outputs (`OUTPUT`) stand here beside 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from operator import attrgetter
@@ -39,18 +39,17 @@ class MetricInputs:
     """What the statistics of one configuration are computed from, over all logs, runs and measured objects.
 
     `rows`: its rows of `tally.parquet` for detections, log by log; `conflicts`: those for implied collisions, None
-    where the experiment does not ask for them. `lists_fixed`, `reaction_fixed`: detections, and braking, are equal in
-    every run. `accuracy`, `exact`: None where the experiment does not ask for it. `output`: times of a recorded output,
-    `link`: of the lists on links; None: the configuration has none. `driving`: rows of `lists.parquet`, or of
-    `sum_lists`; None: without accuracy. `own`: sums of own metrics, by name. `weigh`: what
-    weighs alike, objects or drives.
+    where the experiment does not ask for them. `facts`: what it is (`ConfigurationFacts`), of which `fixed`,
+    `fixed_verdicts`, `truth` and `least_s` are read; None: nothing is known. `accuracy`, `exact`: None where the
+    experiment does not ask for it. `output`: times of a recorded output, `link`: of the lists on links; None: the
+    configuration has none. `driving`: rows of `lists.parquet`, or of `sum_lists`; None: without accuracy. `own`: sums
+    of own metrics, by name. `weigh`: what weighs alike, objects or drives.
     """
 
     rows: pd.DataFrame
     list_rate_hz: float | None
     horizon_s: float | None
-    lists_fixed: bool = False
-    reaction_fixed: bool = False
+    facts: Any = None
     accuracy: AccuracyTotal | None = None
     exact: pd.DataFrame | None = None  # its rows of exact.parquet
     output: OutputTimes | None = None
@@ -102,7 +101,7 @@ def compared_metric(name: str, better: Literal[-1, 1], part: str, header: str, c
     return Metric(name, lambda _: None, lambda _: None, better, "", part, header, compared)
 
 
-def evaluate_metrics(metrics: Iterable[Metric], inputs: MetricInputs) -> dict[str, Value]:
+def evaluate_metrics(metrics: Sequence[Metric], inputs: MetricInputs) -> dict[str, Value]:
     """The columns of one configuration, by name; None: no sample."""
     sums: dict[Hashable, Any] = {}
     row: dict[str, Value] = {}
@@ -111,7 +110,14 @@ def evaluate_metrics(metrics: Iterable[Metric], inputs: MetricInputs) -> dict[st
             sums[metric.statistics] = metric.statistics(inputs)
         if sums[metric.statistics] is not None:
             row[metric.name] = metric.value(sums[metric.statistics])
-    return row
+    return row | (_pin_limits(metrics, row) if getattr(inputs.facts, "truth", False) else {})
+
+
+def _pin_limits(metrics: Sequence[Metric], row: Mapping[str, Value]) -> dict[str, Value]:
+    """The limits of the truth's figures that are the best there can be: so by definition, but for `braking` in time."""
+    best = {of.name: float(of.better > 0) for of in metrics if of.better and of.part != "braking"}
+    pinned = (name for name in best if row.get(f"{name}_low") is not None and row[name] == best[name])
+    return {f"{name}_{end}": best[name] for name in pinned for end in ("low", "high")}
 
 
 def divide_or_none(total: float, number: float) -> float | None:

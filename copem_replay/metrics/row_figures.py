@@ -72,13 +72,14 @@ _INSTANTS = 1000
 class FigureRows:
     """Rows (n,) of a configuration: `table` has the columns of the tally, each row counts by its `weight`.
 
-    `least`: as for `cumulative_incidence`. `clusters`: None: no limits.
+    `least`: as for `cumulative_incidence`. `clusters`: None: no limits. `least_s`: no time to detection can be shorter.
     """
 
     table: pd.DataFrame
     weight: Float
     clusters: Clusters | None
     least: float = 1e-12
+    least_s: float = 0.0
 
     @cached_property
     def known(self) -> Bool:
@@ -124,10 +125,11 @@ class FigureRows:
         if of is None or not followed:
             return LimitedFigure(value)
         groups = int(of.group.max()) + 1
+        bounds = float(time_s[self.known].min(initial=min(self.least_s, horizon_s))), horizon_s
         without = restricted_means_without(
             time_s, ending, self.weight, of.group, groups, horizon_s, least=self.least
         )  # fmt: skip
-        return self._limit_mean(of, value, without, (min(0.0, float(time_s.min())), horizon_s), confidence, followed)
+        return self._limit_mean(of, value, without, bounds, confidence, followed)
 
     def limit_mean(self, values: Float, most: float, confidence: float) -> LimitedFigure:
         """The mean of values (n,), from 0 to `most`."""

@@ -12,7 +12,7 @@ Letters of the shapes: n rows, E episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -202,7 +202,7 @@ LISTS_COLUMNS = ("log", "configuration", "run", *_OF_LISTS, *OF_DRIVING)
 class SliceSettings:
     """What figures are computed with: the horizon in seconds, `measure.began`, own metrics, settings of accuracy.
 
-    `fixed`, `fixed_verdicts`: configurations of which detections, and braking, are equal in every run.
+    `facts`: what configurations are, by name.
     """
 
     configurations: tuple[str, ...]
@@ -211,8 +211,7 @@ class SliceSettings:
     own: tuple[RowMetric, ...] = ()
     accuracy: AccuracySettings | None = None
     conflicts: bool = False
-    fixed: frozenset[str] = frozenset()
-    fixed_verdicts: frozenset[str] = frozenset()
+    facts: Mapping[str, Any] = field(default_factory=dict)
     weigh: str = OBJECTS
 
 
@@ -297,8 +296,7 @@ class StudyRows:
             of(self.detections),
             None,
             own.horizon_s,
-            lists_fixed=configuration in own.fixed,
-            reaction_fixed=configuration in own.fixed_verdicts,
+            facts=own.facts.get(configuration),
             accuracy=None if own.accuracy is None else self._total(configuration, own.accuracy),
             exact=None if self.exact is None else of(select_counted(self.exact, own.words)),
             conflicts=conflicts,

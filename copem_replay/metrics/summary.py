@@ -241,8 +241,8 @@ def summarise_tally(
     """The rows of `summary.csv`, and notes about them, from the rows of `tally.parquet`.
 
     `exact`: the rows of `exact.parquet`. `accuracy`: its sums, by configuration. `facts`: what configurations are
-    (`find_facts`), of which are read `fixed` and `fixed_verdicts`; None: nothing is known. `own`: the experiment's own
-    metrics, whose columns come last; `sums`: their sums. `outputs`: ages of recorded outputs, by configuration;
+    (`find_facts`); None: nothing is known. `own`: the experiment's own metrics, whose columns come last; `sums`: their
+    sums. `outputs`: ages of recorded outputs, by configuration;
     `links`: sums over lists on links, by configuration. `conflicts_asked`: whether the experiment measures when lists
     imply a collision. `weigh`: as `measure.weigh`. `driving`: columns of `lists.parquet` about needless braking.
     """
@@ -258,8 +258,7 @@ def summarise_tally(
             detections_of.get(name, detections.iloc[:0]),
             list_rate_hz[name],
             horizon_s,
-            lists_fixed=getattr((facts or {}).get(name), "fixed", False),
-            reaction_fixed=getattr((facts or {}).get(name), "fixed_verdicts", False),
+            facts=(facts or {}).get(name),
             accuracy=accuracy[name] if accuracy else None,
             exact=exact_of.get(name, exact.iloc[:0]) if exact is not None else None,
             output=(outputs or {}).get(name),
@@ -405,12 +404,9 @@ def describe_no_needless(summary: pd.DataFrame) -> str | None:
 
 def _needless_lines(summary: pd.DataFrame, width: int | None) -> list[str]:
     """The table of braking for nothing, and what it means."""
-    over = {*summary["needless_interval_over"].dropna()}
     lines = _part_lines(summary, "needless", width, RATE)
-    lines += (
-        [f"95 %: Poisson limits over logs; {describe_clusters('logs').partition(': ')[2]}"] if "logs" in over else []
-    )
-    lines += ["95 %: Poisson limits over runs: how far other draws may differ on this drive"] if "runs" in over else []
+    over = summary["needless_interval_over"].dropna().unique()
+    lines += [f"95 %: Poisson limits over {describe_clusters(str(one), driving=True)}" for one in over]
     return [*lines, "needless_*: the driver would have to brake for an entry of a list, and the truth gives no reason"]
 
 

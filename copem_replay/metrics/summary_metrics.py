@@ -132,19 +132,21 @@ class ShareEstimate:
     high: float | None = None
 
 
-def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], weigh: str, *, fixed: bool) -> ShareEstimate:
-    """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: equal in every run."""
-    n, weight = int(part["runs"].sum()), weigh_rows(part, "runs", weigh)
+def _estimate_share(
+    part: pd.DataFrame, successes: NDArray[np.int64], inputs: MetricInputs, fixed: str
+) -> ShareEstimate:
+    """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: the fact that all are alike."""
+    n, weight = int(part["runs"].sum()), weigh_rows(part, "runs", inputs.weigh)
     counted = successes * (weight / part["runs"].to_numpy(dtype=float))
     total = float(counted.sum())
     share = total / n if n else None
-    clusters = find_clusters(part, weigh=weigh)
+    clusters = find_clusters(part, weigh=inputs.weigh)
     if clusters is None or not n:
         return ShareEstimate(n, share)
     if not clusters.by_run:
         low, high = clusters.limit_share(counted, weight, CONFIDENCE)
         return ShareEstimate(n, share, clusters.share_kind, clusters.over, clusters.count, low, high)
-    if fixed:
+    if getattr(inputs.facts, fixed, False):
         return ShareEstimate(n, share, NOTHING_DRAWN)
     runs = n // count_clusters(part)[2]  # passes of a run may be one and the same: a run counts once
     return ShareEstimate(n, share, EXACT, clusters.over, runs, *map(float, exact_limits(total / n * runs, runs)))
@@ -153,9 +155,7 @@ def _estimate_share(part: pd.DataFrame, successes: NDArray[np.int64], weigh: str
 def estimate_detected_share(inputs: MetricInputs) -> ShareEstimate:
     """The share of the rows that are detected."""
     runs = inputs.rows["runs"].to_numpy()
-    return _estimate_share(
-        inputs.rows, np.where(_is_known(inputs.rows), runs, 0), inputs.weigh, fixed=inputs.lists_fixed
-    )  # fmt: skip
+    return _estimate_share(inputs.rows, np.where(_is_known(inputs.rows), runs, 0), inputs, "fixed")
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,8 @@ def limit_means(inputs: MetricInputs) -> tuple[LimitedFigure, LimitedFigure]:
     clusters = find_clusters(inputs.rows, weigh=inputs.weigh)
     if not len(inputs.rows) or inputs.horizon_s is None or clusters is None or clusters.by_run:
         return LimitedFigure(None), LimitedFigure(None)
-    rows = FigureRows(inputs.rows, weigh_rows(inputs.rows, "runs", inputs.weigh), clusters)
+    least_s = getattr(inputs.facts, "least_s", 0.0)
+    rows = FigureRows(inputs.rows, weigh_rows(inputs.rows, "runs", inputs.weigh), clusters, least_s=least_s)
     unknown_s = np.minimum(rows.unknown_s, inputs.horizon_s)
     limited_s = rows.limit_mean(unknown_s, inputs.horizon_s, CONFIDENCE)
     return rows.limit_mean_time(inputs.horizon_s, CONFIDENCE), limited_s
@@ -224,7 +225,7 @@ def estimate_passed_share(inputs: MetricInputs) -> ShareEstimate | None:
     if "in_conflict" not in inputs.rows:
         return None
     part = inputs.rows[inputs.rows["in_conflict"]]
-    return _estimate_share(part, part["passed"].to_numpy(), inputs.weigh, fixed=inputs.reaction_fixed)
+    return _estimate_share(part, part["passed"].to_numpy(), inputs, "fixed_verdicts")
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class ConfigurationFacts:
     truth id, not by match. `fixed`: detections are equal in every run; `fixed_verdicts`: and whether the ego passes.
     `needs_visibility`: its episodes depend on which body hides which. `ideal`: the ideal fusion of its `ideal_of`: of
     its inputs, whose lists come alike, or of its units; None: it is ideal itself, or there is none. `remembering`: the
-    ideal fusion with memory of its inputs, if its own fusion remembers.
+    ideal fusion with memory of its inputs, if its own fusion remembers. `least_s`: no time to detection is shorter.
     """
 
     truth: bool
@@ -51,6 +51,7 @@ class ConfigurationFacts:
     ideal: str | None
     ideal_of: str | None
     remembering: str | None
+    least_s: float = 0.0
 
 
 def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
@@ -78,6 +79,9 @@ def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
             ideal=ideal,
             ideal_of=ideal_of,
             remembering=_find_remembering(experiment, configuration),
+            least_s=0.0
+            if recorded or experiment.measure.count_earlier  # what is known before counts
+            else min(map(configuration.latency_of, experiment.units_of(configuration) or (TRUTH,))),
         )
     return facts
 

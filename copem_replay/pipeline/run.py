@@ -439,8 +439,7 @@ def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFact
         measure.metrics,
         accuracy_settings(measure, 0.0) if measure.accuracy else None,
         measure.conflict is not None,
-        frozenset(name for name, of in facts.items() if of.fixed),
-        frozenset(name for name, of in facts.items() if of.fixed_verdicts),
+        facts,
         measure.weigh,
     )
 

@@ -358,8 +358,8 @@ class _JudgedStudy:
             return None, replace(_NO_ROW, why="no object is in conflict")
         weight = weigh_rows(table, "probability" if exact else "runs", weigh)
         n = round(float(weight.sum()))
-        fixed = study.settings.fixed_verdicts if kind == "braking" else study.settings.fixed
-        if of_runs and (exact or configuration in fixed):
+        facts = study.settings.facts[configuration]
+        if of_runs and (exact or (facts.fixed_verdicts if kind == "braking" else facts.fixed)):
             known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
             return FigureRows(table, weight, None), JudgedFigure(known, n=n)
         clusters, why = find_judged_clusters(table, of_runs=of_runs, weigh=weigh)
@@ -369,7 +369,7 @@ class _JudgedStudy:
         if clusters is not None:
             units = clusters.count if clusters.once else clusters.units
             about = replace(about, over=clusters.over, clusters=clusters.count, units=units)
-        return FigureRows(table, weight, clusters, least), about
+        return FigureRows(table, weight, clusters, least, facts.least_s), about
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
         """By configuration the rows of a group that count."""
@@ -416,7 +416,7 @@ class _JudgedStudy:
         over: str, least: float = 0.0,
     ) -> JudgedFigure:  # fmt: skip
         clusters, why = None, ""
-        fixed = criterion.of_runs and configuration in self.traffic.settings.fixed
+        fixed = criterion.of_runs and self.traffic.settings.facts[configuration].fixed
         if not fixed:
             clusters, why = find_judged_clusters(rows, of_runs=criterion.of_runs)
         values, weight = rows[list(columns)].to_numpy(dtype=float), rows[over].to_numpy(dtype=float)

@@ -300,6 +300,10 @@ def test_an_interval_says_what_it_is_over():
     assert describe_clusters("objects", 12).startswith("12 objects of this drive: ")
     assert "nothing about other drives" in describe_clusters("objects")
     assert describe_clusters("runs", 1).startswith("1 run of this one object: ")
+    assert describe_clusters("runs", 20, driving=True) == (
+        "20 runs of the driving: how far other draws of the same models may differ; nothing about other drives"
+    )
+    assert describe_clusters("logs", 8, driving=True) == describe_clusters("logs", 8)
     assert describe_clusters("passes", 9).startswith("9 passes of this one object: how far other passes of this object")
 
 

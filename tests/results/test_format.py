@@ -48,7 +48,7 @@ def test_results_that_do_not_say_what_configurations_are_are_refused(
     facts = said.pop("configurations")
     assert facts["GT"] == {
         "truth": True, "recorded": False, "by_truth_id": True, "fixed": True, "fixed_verdicts": False,
-        "needs_visibility": False, "ideal": None, "ideal_of": None, "remembering": None,
+        "needs_visibility": False, "ideal": None, "ideal_of": None, "remembering": None, "least_s": 0.0,
     }  # fmt: skip
     (folder / "provenance.json").write_text(json.dumps(said))
     with pytest.raises(cr.InputError, match=r"no 'configurations'; run the experiment again with --overwrite$"):

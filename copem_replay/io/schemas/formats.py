@@ -111,6 +111,12 @@ def detection3d(offers: Collection[str]) -> Description:
     return Description(Fields.model_validate(fields))
 
 
+_POSE = {
+    "x_m": "pose.position.x", "y_m": "pose.position.y", "z_m": "pose.position.z",
+    "yaw_rad": Yaw(quaternion="pose.orientation"),
+}  # fmt: skip
+
+
 def derived(offers: Collection[str]) -> Description:
     """derived_object_msgs/ObjectArray, as the CARLA bridge writes it: twist along the axes of the list."""
     return Description(
@@ -121,10 +127,7 @@ def derived(offers: Collection[str]) -> Description:
                 "frame": "header.frame_id",
                 "id": "id",
                 "class": ClassField(path="classification", map=_DERIVED),
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
+                **_POSE,
                 "length_m": "shape.dimensions[0]",
                 "width_m": "shape.dimensions[1]",
                 "height_m": "shape.dimensions[2]",
@@ -146,10 +149,7 @@ def markers(offers: Collection[str]) -> Description:
                 "frame": "markers[].header.frame_id",
                 "id": "id",
                 "class": ClassField(path="ns"),
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
+                **_POSE,
                 "length_m": "scale.x",
                 "width_m": "scale.y",
                 "height_m": "scale.z",
@@ -180,10 +180,7 @@ def description(offers: Collection[str]) -> Description:
                 "frame": "entities[].frame_id" if "entities[].frame_id" in offers else None,
                 "id": "/entities[].id" if "entities[].id" in offers else None,
                 "class": class_field if classes else None,
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
+                **_POSE,
                 "length_m": "size.x",
                 "width_m": "size.y",
                 "height_m": "size.z",

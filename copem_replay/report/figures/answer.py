@@ -112,7 +112,8 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         if clusters is not None and not (clusters.by_run and results.facts[name].fixed):
             kept = (results.known["configuration"] == name).to_numpy()
             of_name = results.known[kept]
-            rows_of_name = FigureRows(of_name, weigh_rows(of_name, "runs", weigh), clusters.select(kept))
+            weight, least_s = weigh_rows(of_name, "runs", weigh), results.facts[name].least_s
+            rows_of_name = FigureRows(of_name, weight, clusters.select(kept), least_s=least_s)
             found = rows_of_name.limit_mean_time(horizon_s, CONFIDENCE)
             reason = f"all {clusters.over} alike" if found.kind == ALL_ALIKE else "no object is followed to the horizon"
         if found is None or np.isnan(found.low):

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import pandas as pd
 
 from copem_replay.core.errors import InputError, count_noun, unknown_name_message
 from copem_replay.core.tracks import SAME_INSTANT_S
+from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.columns import COMPARISON
 from copem_replay.metrics.limits import (
     CONFIDENCE,
@@ -133,6 +134,7 @@ class PairsAsked:
     """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
     is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
     began. `over_runs`: intervals are over runs of the logs. `weigh`: what counts alike; None: as `measure.weigh`.
+    `by_log`: there are also rows of each log.
     """
 
     episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
@@ -140,6 +142,7 @@ class PairsAsked:
     over_runs: bool = False
     confidence: float = CONFIDENCE
     weigh: str | None = None
+    by_log: bool = True
 
     def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
         """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
@@ -283,7 +286,7 @@ class Comparison:
         table, groups = (of if of is None else of[of["configuration"].isin(names)] for of in (self.table, self.groups))
         return replace(self, configurations=names, table=table, groups=groups)
 
-    @property
+    @cached_property
     def overall(self) -> pd.DataFrame:
         """The rows of all logs."""
         return self.table.drop_duplicates(["configuration", "metric"])  # they come first, and a log may be named `all`
@@ -458,7 +461,7 @@ def _compare_each_log(
             _check_same_frames(labelled, first, against, second, log)
             regrets = _compute_regrets(first, second, held, grid, settings[labelled], metrics)
             sums[labelled].add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
-            for regret in regrets if len(logs) > 1 else ():
+            for regret in regrets if len(logs) > 1 and asked.by_log else ():
                 values = regret.figure.values()
                 sums[labelled].differences.setdefault(regret.metric, []).append(values[2])
                 rows.append({"log": log, **pair_rows.make(labelled, regret, values)})
@@ -529,7 +532,7 @@ class PairRows:
                     if (decisive := find_decisive_log(regret.figure, values[2], self.names)) is not None:
                         row["hangs_on"], row["difference_without_it"] = decisive[0], _number_or_none(decisive[1])
                 rows.append(row)
-                limit.append(partial(self._limit, labelled, regret, values[2]))
+                limit.append(partial(self._limit, labelled, regret, values))
         return rows, limit
 
     def make(
@@ -542,7 +545,7 @@ class PairRows:
             "metric": regret.metric, "value": value, "baseline_value": baseline_value,
             "n": int(figure.items["n"].sum()), "difference": difference, "star": None, "word": None,
         }  # fmt: skip
-        row |= self._limit(labelled, regret, values[2], self.asked.confidence)
+        row |= self._limit(labelled, regret, values, self.asked.confidence)
         if "only" in figure.items.columns:
             only = figure.items["only"].sum(axis=0)
             row |= {"only_configuration": int(only[0]), "only_baseline": int(only[1])}
@@ -560,18 +563,17 @@ class PairRows:
         return self.remembering.get(labelled, self.pairs[labelled]) if metric in HELD_METRICS else self.pairs[labelled]
 
     def _limit(
-        self, labelled: LabelledConfiguration, regret: Regret, difference: float, confidence: float
+        self, labelled: LabelledConfiguration, regret: Regret, values: tuple[float, float, float], confidence: float
     ) -> dict[str, object]:
         """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
-        over, sides = (
-            "runs" if self.asked.over_runs else regret.over,
-            (labelled, self._baseline_of(labelled, regret.metric)),
-        )
+        over, difference = "runs" if self.asked.over_runs else regret.over, values[2]
+        sides = labelled, self._baseline_of(labelled, regret.metric)
         what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
         fixed = all(getattr(side.facts, what) for side in sides)
         limits = difference_limits(regret.figure, difference, over, self.names, fixed=fixed, confidence=confidence)
-        sign = COMPARED[regret.metric].better * (_is_never_worse(*sides) - _is_never_worse(*sides[::-1]))
-        if sign * difference < 0 or regret.metric not in _IN_TIME or not sign:
+        never = [_is_never_worse(regret.metric, *of) for of in zip(sides, sides[::-1], values, strict=False)]
+        sign = COMPARED[regret.metric].better * (never[0] - never[1])
+        if sign * difference < 0 or not sign:
             return limits
         least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
         ends: dict[str, Any] = {name: limits.get(name) for name in ("low", "high", "low_bounded", "high_bounded")}
@@ -584,11 +586,19 @@ def _number_or_none(value: float) -> float | None:
 
 _IN_TIME = ("detected_share", "ttd_rmst_s", "ttd_both_s", "unknown_to_horizon_s")
 """Metrics in which nothing is better than the truth, nor than ideal fusion of the same lists, row by row."""
+_OF_ERRORS = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min", SHARE)
+"""Metrics in which nothing is better than a truth without latency, which has 0."""
 
 
-def _is_never_worse(one: LabelledConfiguration, other: LabelledConfiguration) -> bool:
-    """Whether one knows every object at the instant at which the other does, or before, whatever is drawn."""
+def _is_never_worse(metric: str, one: LabelledConfiguration, other: LabelledConfiguration, value: float) -> bool:
+    """Whether one, which has a `value`, is as good as the other in every row, or better, whatever is drawn.
+
+    What is fused by truth ids has no false positive.
+    """
     facts = other.facts
+    if metric not in _IN_TIME:
+        by_id = one.facts.by_truth_id and metric == "false_positives_per_min"
+        return value == 0 and metric in _OF_ERRORS and (one.facts.truth or by_id)
     of_inputs = one.results is other.results and (facts.ideal, facts.ideal_of) == (one.configuration, "inputs")
     return one.facts.truth or (of_inputs and not facts.recorded)
 

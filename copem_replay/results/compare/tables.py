@@ -172,8 +172,11 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     if comparison.baseline_why is not None:
         yield f"baseline {comparison.baseline}: {comparison.baseline_why}; --baseline names another"
     limited = overall.dropna(subset="interval_over")
-    by_kind = limited.groupby("interval_over", sort=False)
-    kinds = [describe_clusters(str(kind), int(of["clusters"].max()), int(of["clusters"].min())) for kind, of in by_kind]
+    of_driving = limited["metric"].map(lambda metric: COMPARED[metric].part == "needless").rename("driving")
+    kinds = [
+        describe_clusters(str(kind), int(of["clusters"].max()), int(of["clusters"].min()), bool(driving))
+        for (kind, driving), of in limited.groupby(["interval_over", of_driving], sort=False)
+    ]
     if kinds:
         yield f"[95 %]: over {'; '.join(kinds)}"
     yield from _describe_logs(limited[limited["interval_over"] == "logs"])
@@ -276,16 +279,12 @@ def held_cells(comparison: Comparison) -> pd.DataFrame:
     for header, names, shown in (
         ("listed by one only", ("only_configuration", "only_baseline"), str),
         ("mean age, s", ("age_s", "baseline_age_s"), "{:.3f}".format),  # to the millisecond, so that pairs align
-        ("no list", ("no_list_share", "baseline_no_list_share"), _format_percent),
+        ("no list", ("no_list_share", "baseline_no_list_share"), lambda share: f"{100 * share:.3g} %"),
         ("no truth", ("without_truth", "baseline_without_truth"), str),
     ):
         both = zip(*(rows[name] for name in names), strict=True)
         columns[header] = [" / ".join("–" if pd.isna(one) else shown(one) for one in sides) for sides in both]
     return pd.DataFrame(columns)
-
-
-def _format_percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
 
 
 _HTML = {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
