@@ -15,7 +15,7 @@ from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.results.remedy import tell_what_helps
 from copem_replay.results.shown_objects import SHOWN_OBJECTS
-from copem_replay.viewer.camera import Camera
+from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
@@ -130,6 +130,12 @@ class RecordingContent:
             for name in self.configurations
         ]
         return "\n\n".join(["False tracks, about nobody, of this run, the longest first", *parts])
+
+    def follow(self, eye: Camera) -> MovingPicture:
+        """What a camera that moves shows, with the masts that have names: around one object, or the ego and all."""
+        stories = {k: span for k, span in self.axes_s.items() if eye.turns or k == eye.object_ix}
+        masts = {k: {name for of in self.configurations for name in self.named_masts(of, [k])} for k in stories}
+        return follow_episodes(self.replay, self.experiment, eye, stories, masts)
 
     def helps(self, object_ix: int) -> str:
         """What would help with an object; “” where configurations are of several experiments: PEMs may differ, too."""

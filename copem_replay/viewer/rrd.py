@@ -31,14 +31,12 @@ from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, digest_layout, view_aspect
 from copem_replay.viewer.camera import (
+    BESIDE_ASPECTS,
     MovingPicture,
     camera_above,
     camera_following,
     camera_on_ego,
     find_up_rad,
-    follow_ego,
-    include_places,
-    write_camera_origin,
     write_moving_origin,
 )
 from copem_replay.viewer.curves import write_differences
@@ -175,10 +173,7 @@ class _RecordingFile:
     @cached_property
     def picture(self) -> MovingPicture | None:
         """What the camera on the ego shows; None: it stands still."""
-        content = self.content
-        if not content.eye.turns:
-            return None
-        return follow_ego(content.replay, content.experiment, content.eye, content.axes_s)
+        return self.content.follow(self.content.eye) if self.content.eye.turns else None
 
 
 def _build_content(
@@ -193,10 +188,8 @@ def _build_content(
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in objects}
     axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
     eye = camera_on_ego(replay, experiment, axes_s, view_aspect(experiment, configurations))
-    eyes = [
-        include_places(camera_following(replay, experiment, table, k), sensors.watching_places(replay, episodes[k]))
-        for k in objects[:NEAR_BY]
-    ]
+    aspect = BESIDE_ASPECTS[len(objects) > 1]
+    eyes = [camera_following(replay, experiment, table, k, aspect) for k in objects[:NEAR_BY]]
     onset_s = float(episodes[objects[0]]["onset_s"].iloc[0]) if objects else 0.0
     named_units = choose_named_units(replay, experiment, eye.at_m, onset_s)
     above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
@@ -236,7 +229,7 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
     if file.picture is not None:
         write_moving_origin(out, replay, file.picture)
     for eye in content.eyes:
-        write_camera_origin(out, replay, eye)
+        write_moving_origin(out, replay, content.follow(eye))
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]
