@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.tracks import CLASSES, TRUTH
+from copem_replay.core.colours import Rgb
+from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
-from copem_replay.results.remedy import tell_what_helps
-from copem_replay.results.shown_objects import SHOWN_OBJECTS
+from copem_replay.results.remedy import find_changed_keys, tell_what_helps
+from copem_replay.results.shown_objects import (
+    AFTER_S,
+    BEFORE_S,
+    SHOWN_OBJECTS,
+    UNKNOWN_S,
+    pick_evenly,
+    select_differing_rows,
+)
 from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
@@ -91,6 +99,7 @@ class RecordingContent:
     opens_s: float | None = None
     counted: pd.DataFrame | None = None
     false_tracks: pd.DataFrame | None = None
+    colours: Mapping[str, Rgb] = field(default_factory=dict)
     brief: Collection[int] = ()
     of_one: bool = True
 
@@ -192,26 +201,70 @@ def overview_page(content: RecordingContent) -> rrb.Container:
     views = list[rrb.View](tracks_views(content, choose_overview(content)))
     columns = 1 if len(views) < FEW else 2
     words: list[rrb.View] = [difference_view(DIFFERENCE_SHORT)]
-    if len(views) % columns:
-        views.append(legend_view())  # into the free cell
-    else:
-        words.append(legend_view())
+    (views if len(views) % columns else words).append(legend_view())  # into the free cell, if there is one
+    return _page_with_lanes(content, rrb.Grid(*views, grid_columns=columns), words, "Overview")
+
+
+def _page_with_lanes(
+    content: RecordingContent, scenes: rrb.View | rrb.Container, words: Sequence[rrb.View], name: str
+) -> rrb.Container:
+    """Scenes, beside them the lanes of each object in tabs, and views with words below."""
+    import rerun.blueprint as rrb
+
     lanes = [rrb.Tabs(*(lanes_view(content, k) for k in content.objects))] if content.objects else []
-    beside = [*lanes, rrb.Tabs(*words)]
-    return rrb.Horizontal(
-        rrb.Grid(*views, grid_columns=columns),
-        rrb.Vertical(*beside),
-        column_shares=list(OVERVIEW_SHARES),
-        name="Overview",
-    )
+    beside = rrb.Vertical(*lanes, rrb.Tabs(*words))
+    return rrb.Horizontal(scenes, beside, column_shares=list(OVERVIEW_SHARES), name=name)
+
+
+def side_by_side_page(content: RecordingContent, early: str, late: str) -> rrb.Container:
+    """Two configurations in one scene, `early` with solid boxes, `late` in outlines; beside it as in the overview."""
+    units = tuple(dict.fromkeys((*content.received(early), *content.received(late))))
+    scene = world_view(
+        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", content.eye, units=units, solid=early,
+        named=content.named_masts(early, content.objects) or content.named_masts(late, content.objects),
+    )  # fmt: skip
+    return _page_with_lanes(content, scene, [difference_view(DIFFERENCE_SHORT), legend_view()], "Side by side")
+
+
+def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) -> float | None:
+    """The instant (s) at which a recording opens: some configurations know an object and others do not yet.
+
+    It is early in the longest such time of the first object that has one, within its axis. Where all objects are known
+    to all configurations at once, it is just before the first onset; None without an object. `by_object`: rows of each
+    object, the most telling one first.
+    """
+    for rows in by_object:
+        rows = select_differing_rows(experiment, rows)
+        never_s = np.minimum(rows["ended_s"], rows["onset_s"] + UNKNOWN_S)
+        times_s = np.sort(rows["detection_s"].fillna(never_s).to_numpy(dtype=float))
+        waits_s = np.diff(times_s)
+        if waits_s.max(initial=0.0) > SAME_INSTANT_S:
+            k = int(waits_s.argmax())
+            return float(times_s[k] + min(waits_s[k] / 2, AFTER_S))
+    onsets_s = [float(rows["onset_s"].iloc[0]) for rows in by_object]
+    return max(min(onsets_s) - BEFORE_S, 0.0) if onsets_s else None
+
+
+def choose_pair(content: RecordingContent) -> tuple[str, ...]:
+    """The configurations of the scene with two: one that knows an object where the recording opens, and one that does
+    not yet. Of several pairs the first with fewest other keys; without a difference the first two; () for fewer.
+    """
+    names, opens_s = select_perceiving(content.experiment, content.configurations), content.opens_s
+    for k in content.objects:
+        rows = content.episodes[k]
+        known = set(rows.loc[rows["detection_s"] <= opens_s, "configuration"])
+        pairs = [(a, b) for a in names for b in names if a in known and b not in known]
+        if pairs:
+            return min(pairs, key=lambda pair: len(find_changed_keys(content.experiment, *pair)))
+    return tuple(names[:2]) if len(names) > 1 else ()
 
 
 def choose_overview(content: RecordingContent) -> list[str]:
     """The configurations of the overview: all with units, of more than four the baseline and those that differ most.
 
     The baseline is the first one with units, unless configurations are compared with another. The rest is spread evenly
-    from the one that knows the shown objects first to the one that knows them last. Of several baselines the first
-    stand beside what is held against them.
+    from the one that knows the shown objects first to the one that knows them last, in colours that differ. Of several
+    baselines the first stand beside what is held against them.
     """
     perceiving = select_perceiving(content.experiment, content.configurations)
     if len(perceiving) <= OVERVIEW or len(content.baselines) > 1:
@@ -221,8 +274,7 @@ def choose_overview(content: RecordingContent) -> list[str]:
     mean_s = after_s.groupby(rows["configuration"]).mean()
     baseline = next((name for name in content.baselines if name in perceiving), perceiving[0])
     ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
-    places = OVERVIEW - 1
-    chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {baseline}
+    chosen = pick_evenly(ranked, OVERVIEW, [baseline], content.colours)
     return [name for name in perceiving if name in chosen]
 
 
@@ -400,12 +452,13 @@ def count_columns(views: int) -> int:
 
 def world_view(
     content: RecordingContent, configuration: str, title: str, eye: Camera, *, units: Sequence[str],
-    fields: bool = False, marks: bool = False, named: Sequence[str] = (), quiet: bool = False,
+    fields: bool = False, marks: bool = False, named: Sequence[str] = (), quiet: bool = False, solid: str = "",
 ) -> rrb.Spatial3DView:  # fmt: skip
     """A view of truth and one configuration, with `units` as points and, with `fields`, their fields of view.
 
     `marks`: with the lasting lines to the places of objects at their detection. `named`: units with visible names.
-    `quiet`: these are the only labels.
+    `quiet`: these are the only labels. `solid`: another configuration in the same scene, without words: its boxes are
+    solid, and the others outlines.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -418,6 +471,13 @@ def world_view(
     near = not eye.turns and eye.object_ix is not None
     # Words of the other pictures would lie over bodies.
     contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if quiet or (words == WORDS) == near]
+    overrides: dict[Any, Any] = {make_entity_path("world", "units", unit): shown for unit in named}
+    if solid:
+        other, modes = make_entity_path("world", configuration_part(solid)), rr.components.FillMode
+        contents += [f"+ {other}/**", *(f"- {other}/{kind}" for kind in ("marks/**", WORDS, NEAR_WORDS))]
+        contents += [f"- {path}/covariance" for path in (part, other)]
+        overrides[f"{other}/boxes"] = rr.Boxes3D.from_fields(fill_mode=modes.Solid)
+        overrides[f"{part}/boxes"] = rr.Boxes3D.from_fields(fill_mode=modes.MajorWireframe)
     if eye.turns:
         on_edge = ["arrows"], ["false", configuration_part(configuration)]
         contents += [f"+ {make_entity_path(*eye.path, *entity)}" for entity in on_edge]
@@ -428,7 +488,7 @@ def world_view(
         eye_controls=rrb.EyeControls3D(
             position=eye.place_m.tolist(), look_target=eye.target_m.tolist(), eye_up=(0, 0, 1)
         ),
-        overrides={make_entity_path("world", "units", unit): shown for unit in named},
+        overrides=overrides,
         line_grid=False,
         background=GROUND,
     )
@@ -470,7 +530,7 @@ def _curves_view(
     )
 
 
-LAYOUT = 7
+LAYOUT = 8
 """Version of the blueprint, raised with every change: a viewer prefers the one it has kept for an application id."""
 
 
@@ -480,7 +540,8 @@ def build_blueprint(content: RecordingContent) -> rrb.Blueprint:
 
     pages = [overview_page(content)]
     if content.objects:
-        pages += [lanes_page(content), reasons_page(content)]
+        two = [side_by_side_page(content, *pair)] if (pair := choose_pair(content)) else []
+        pages += [lanes_page(content), *two, reasons_page(content)]
     pages += [tracks_page(content), errors_page(content)]
     if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
@@ -521,6 +582,7 @@ def digest_layout(content: RecordingContent) -> str:
         list(content.named),
         *content.selected_ns,
         content.baselines or None,
+        choose_pair(content),
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
         *(["map"] if content.with_map else []),

@@ -163,8 +163,8 @@ def follow_episodes(
     """What a camera that follows shows: each object during its story, together with what it follows, the ego and units.
 
     What hides an object is between them. Stories for which the picture would be wider than `WIDEST_M` are left out, the
-    first ones last. `stories`: as in `camera_on_ego`; `masts`: by object, units that are in the picture with it, if they
-    are as near as `TOGETHER_M`, like the ego.
+    first ones last. `stories`: as in `camera_on_ego`; `masts`: by object, units in the picture with it; these and the
+    ego are, if they are as near as `TOGETHER_M`.
     """
     assert eye.object_ix is not None
     time_s, own = _own_states(replay, eye.object_ix)
@@ -225,11 +225,9 @@ def write_moving_origin(out: RecordingSink, replay: Replay, picture: MovingPictu
     """
     import rerun as rr
 
-    target = picture.own + _turn(picture.middle, picture.yaw_rad)
-    origin = rr.Transform3D.columns(
-        translation=stack_float32(*target), rotation_axis_angle=upright_turns(picture.yaw_rad),
-        scale=stack_float32(*[picture.scale] * 3),
-    )  # fmt: skip
+    target = stack_float32(*(picture.own + _turn(picture.middle, picture.yaw_rad)))
+    turn = {"rotation_axis_angle": upright_turns(picture.yaw_rad)} if picture.eye.turns else {}
+    origin = rr.Transform3D.columns(translation=target, scale=stack_float32(*[picture.scale] * 3), **turn)
     out.columns(picture.eye.path, picture.elapsed_ns, origin)
     if picture.seen and picture.eye.turns:
         _write_arrows(out, replay, picture)

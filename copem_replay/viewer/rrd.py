@@ -26,10 +26,17 @@ from copem_replay.perception.observation import Observations
 from copem_replay.pipeline.one_run import share_curves
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import Sight, compute_sight, find_looked_at
-from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
+from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
-from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, digest_layout, view_aspect
+from copem_replay.viewer.blueprint import (
+    NEAR_BY,
+    RecordingContent,
+    build_blueprint,
+    digest_layout,
+    find_opening_s,
+    view_aspect,
+)
 from copem_replay.viewer.camera import (
     BESIDE_ASPECTS,
     MovingPicture,
@@ -116,6 +123,7 @@ def write_rrd(
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
     beside = [name for name in first if name not in truths] if not baselines else []
     parts = split_into_files(beside or list(first), baselines)
+    by_name = colours or configuration_colours(experiment.configurations, truths)
     shown = choose_shown_objects(replay.scene, replay.truth, experiment, table)
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
@@ -124,13 +132,12 @@ def write_rrd(
         for part in parts:
             content = replace(
                 _build_content(replay, experiment, table, part.configurations, shown, first, baselines),
-                of_one=of_one, counted=counted, false_tracks=false_tracks,
+                of_one=of_one, counted=counted, false_tracks=false_tracks, colours=by_name,
             )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            by_name = colours or configuration_colours(experiment.configurations, truths)
             files.append(_RecordingFile(out, content, {name: by_name[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baselines:  # of all objects at once: such a log is not long

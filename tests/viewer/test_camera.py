@@ -23,8 +23,8 @@ from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.pipeline.expansion import resolve_for_run
 from copem_replay.pipeline.prepare import Replay, prepare_log
 from copem_replay.pipeline.replay import replay_block
-from copem_replay.results.shown_objects import axis_s, choose_shown_objects, find_opening_s, select_differing_rows
-from copem_replay.viewer.blueprint import select_perceiving, view_aspect
+from copem_replay.results.shown_objects import axis_s, choose_shown_objects, select_differing_rows
+from copem_replay.viewer.blueprint import find_opening_s, select_perceiving, view_aspect
 from copem_replay.viewer.camera import (
     TOGETHER_M,
     Camera,
@@ -74,9 +74,8 @@ def origins(path: Path, eye: Camera, entity: str = "ego") -> list[tuple[float, F
         return [(0.0, np.zeros(3), 0.0, 1.0)]
     found = []
     for row in rows(path, f"/world/eyes/{entity}"):
-        [place], [size], [turn] = (
-            row[f"Transform3D:{name}"] for name in ("translation", "scale", "rotation_axis_angle")
-        )
+        [place], [size] = (row[f"Transform3D:{name}"] for name in ("translation", "scale"))
+        [turn] = row.get("Transform3D:rotation_axis_angle", [{"axis": [0, 0, 1], "angle": 0.0}])
         assert size[0] == size[1] == size[2]
         assert turn["axis"] == [0, 0, 1]
         found.append((row["elapsed"] / 1e9, np.array(place), float(turn["angle"]), float(size[0])))

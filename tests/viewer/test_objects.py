@@ -10,7 +10,8 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.results.shown_objects import choose_shown_objects, find_opening_s
+from copem_replay.results.shown_objects import choose_shown_objects
+from copem_replay.viewer.blueprint import find_opening_s
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import make, static
 

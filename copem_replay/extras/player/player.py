@@ -129,7 +129,8 @@ def write_section(study: ReportData) -> tuple[str, list[Html]] | None:
 def player_element(study: ReportData) -> Html | None:
     """The player of a run with its data; words where the log cannot be replayed again; None where no run is shown."""
     results, shown = study.results, study.results.provenance.run_shown
-    names = find_differing(results, study.contenders, MOST_CONFIGURATIONS)
+    colours = {name: look.dark for name, look in study.looks.items()}
+    names = find_differing(results, study.contenders, MOST_CONFIGURATIONS, colours)
     if not shown or not names or not len(results.known):
         return None
     try:
