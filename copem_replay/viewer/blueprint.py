@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.colours import Rgb
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, TRUTH
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.false_tracks import describe_false_tracks
@@ -23,7 +22,7 @@ from copem_replay.results.shown_objects import (
     pick_evenly,
     select_differing_rows,
 )
-from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
+from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes, step_back
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
@@ -68,6 +67,8 @@ OVERVIEW, FEW = 4, 3
 """Most views of the overview, and the number from which they are in two columns: each at least 400 × 200 points."""
 OVERVIEW_SHARES = (2.1, 1.0)
 """Widths of the overview's views and of what is beside them."""
+LARGE_ASPECT = 1.45
+"""Width by height of one view in the place of the overview's, in a window of 1280 × 720."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,6 @@ class RecordingContent:
     opens_s: float | None = None
     counted: pd.DataFrame | None = None
     false_tracks: pd.DataFrame | None = None
-    colours: Mapping[str, Rgb] = field(default_factory=dict)
     brief: Collection[int] = ()
     of_one: bool = True
 
@@ -219,8 +219,9 @@ def _page_with_lanes(
 def side_by_side_page(content: RecordingContent, early: str, late: str) -> rrb.Container:
     """Two configurations in one scene, `early` with solid boxes, `late` in outlines; beside it as in the overview."""
     units = tuple(dict.fromkeys((*content.received(early), *content.received(late))))
+    eye = step_back(content.eye, LARGE_ASPECT)
     scene = world_view(
-        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", content.eye, units=units, solid=early,
+        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", eye, units=units, solid=early,
         named=content.named_masts(early, content.objects) or content.named_masts(late, content.objects),
     )  # fmt: skip
     return _page_with_lanes(content, scene, [difference_view(DIFFERENCE_SHORT), legend_view()], "Side by side")
@@ -263,8 +264,8 @@ def choose_overview(content: RecordingContent) -> list[str]:
     """The configurations of the overview: all with units, of more than four the baseline and those that differ most.
 
     The baseline is the first one with units, unless configurations are compared with another. The rest is spread evenly
-    from the one that knows the shown objects first to the one that knows them last, in colours that differ. Of several
-    baselines the first stand beside what is held against them.
+    from the one that knows the shown objects first to the one that knows them last. Of several baselines the first
+    stand beside what is held against them.
     """
     perceiving = select_perceiving(content.experiment, content.configurations)
     if len(perceiving) <= OVERVIEW or len(content.baselines) > 1:
@@ -274,7 +275,7 @@ def choose_overview(content: RecordingContent) -> list[str]:
     mean_s = after_s.groupby(rows["configuration"]).mean()
     baseline = next((name for name in content.baselines if name in perceiving), perceiving[0])
     ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
-    chosen = pick_evenly(ranked, OVERVIEW, [baseline], content.colours)
+    chosen = pick_evenly(ranked, OVERVIEW, [baseline])
     return [name for name in perceiving if name in chosen]
 
 

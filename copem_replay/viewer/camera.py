@@ -385,7 +385,14 @@ def camera_above(places_m: Float, heading_rad: float, aspect: float = 1.5) -> Ca
     middle = [(way @ places_m).min() / 2 + (way @ places_m).max() / 2 for way in (right, forward)]
     target = middle[0] * right + middle[1] * forward + [0.0, 0.0, places_m[2].mean()]
     away_m = max(float(_fitting_distances(places_m - target[:, None], towards, aspect).max()), CLOSE_M)
-    return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target, heading_rad=heading_rad)
+    place = np.round(target - away_m * towards, 1)
+    return Camera(place, np.round(target, 1), target, heading_rad=heading_rad, aspect=aspect)
+
+
+def step_back(eye: Camera, aspect: float) -> Camera:
+    """A camera that holds the same in a view of another width by height."""
+    farther = max(eye.aspect / aspect, 1.0)
+    return replace(eye, place_m=eye.target_m + farther * (eye.place_m - eye.target_m))
 
 
 def _look(heading_rad: float, down_rad: float = ABOVE_RAD) -> Float:

@@ -107,7 +107,7 @@ def write_rrd(
 
     More than seven configurations go into several files, such as `replay.configurations_8-14.rrd`; the ground truth is
     none of them, unless it is alone or compared. Colours depend on all of the experiment's configurations, also on
-    those that are not written.
+    those that are not written; those of a file differ.
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
@@ -123,7 +123,6 @@ def write_rrd(
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
     beside = [name for name in first if name not in truths] if not baselines else []
     parts = split_into_files(beside or list(first), baselines)
-    by_name = colours or configuration_colours(experiment.configurations, truths)
     shown = choose_shown_objects(replay.scene, replay.truth, experiment, table)
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
@@ -132,12 +131,14 @@ def write_rrd(
         for part in parts:
             content = replace(
                 _build_content(replay, experiment, table, part.configurations, shown, first, baselines),
-                of_one=of_one, counted=counted, false_tracks=false_tracks, colours=by_name,
+                of_one=of_one, counted=counted, false_tracks=false_tracks,
             )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
+            every = experiment.configurations
+            by_name = colours or configuration_colours(every, truths, shown=part.configurations)
             files.append(_RecordingFile(out, content, {name: by_name[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baselines:  # of all objects at once: such a log is not long
