@@ -22,7 +22,7 @@ from copem_replay.results.shown_objects import (
     pick_evenly,
     select_differing_rows,
 )
-from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes, step_back
+from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
@@ -67,8 +67,8 @@ OVERVIEW, FEW = 4, 3
 """Most views of the overview, and the number from which they are in two columns: each at least 400 × 200 points."""
 OVERVIEW_SHARES = (2.1, 1.0)
 """Widths of the overview's views and of what is beside them."""
-LARGE_ASPECT = 1.45
-"""Width by height of one view in the place of the overview's, in a window of 1280 × 720."""
+LARGE_ASPECT = 1.5
+"""Width by height of one view in the place of the overview's, and of one of four there, in a window of 1280 × 720."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ class RecordingContent:
     """What one file shows: a run, its configurations in order, and the shown objects, the most telling one first.
 
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
-    Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
-    names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
-    `opens_s`: the instant at which the recording opens. `counted`: rows of the table that count, of all passes;
-    `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that are known too briefly for
-    words in a lane. `of_one`: all configurations are of one experiment.
+    Camera `eye` follows the ego, if there is one, `large` too, in one large view, `eyes` the objects; `above` looks at
+    the units, of which `named` have names. `lists`: lists that units send by a link, by configuration. `too_short`: ids
+    of objects too short to judge. `opens_s`: the instant at which the recording opens. `counted`: rows of the table
+    that count, of all passes; `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that
+    are known too briefly for words in a lane. `of_one`: all configurations are of one experiment.
     """
 
     replay: Replay
@@ -91,6 +91,7 @@ class RecordingContent:
     objects: Sequence[int]
     axes_s: Mapping[int, tuple[float, float]]
     eye: Camera
+    large: Camera
     eyes: Sequence[Camera]
     above: Camera
     named: Sequence[str]
@@ -219,9 +220,8 @@ def _page_with_lanes(
 def side_by_side_page(content: RecordingContent, early: str, late: str) -> rrb.Container:
     """Two configurations in one scene, `early` with solid boxes, `late` in outlines; beside it as in the overview."""
     units = tuple(dict.fromkeys((*content.received(early), *content.received(late))))
-    eye = step_back(content.eye, LARGE_ASPECT)
     scene = world_view(
-        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", eye, units=units, solid=early,
+        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", content.large, units=units, solid=early,
         named=content.named_masts(early, content.objects) or content.named_masts(late, content.objects),
     )  # fmt: skip
     return _page_with_lanes(content, scene, [difference_view(DIFFERENCE_SHORT), legend_view()], "Side by side")
@@ -571,7 +571,7 @@ def digest_layout(content: RecordingContent) -> str:
     scene = content.replay.scene
     eyes = [
         (eye.place_m.tolist(), eye.target_m.tolist(), eye.object_ix)
-        for eye in (content.eye, *content.eyes, content.above)
+        for eye in (content.eye, content.large, *content.eyes, content.above)
     ]
     parts = (
         LAYOUT,
@@ -593,7 +593,7 @@ def digest_layout(content: RecordingContent) -> str:
 
 def view_aspect(experiment: Experiment, configurations: Sequence[str]) -> float:
     """Width by height of a view of the overview in a window of 1280 × 720: two views are one above the other."""
-    return 3.0 if len(select_perceiving(experiment, configurations)) == FEW - 1 else 1.5
+    return 3.0 if len(select_perceiving(experiment, configurations)) == FEW - 1 else LARGE_ASPECT
 
 
 def select_perceiving(experiment: Experiment, configurations: Sequence[str]) -> list[str]:

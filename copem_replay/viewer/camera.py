@@ -389,12 +389,6 @@ def camera_above(places_m: Float, heading_rad: float, aspect: float = 1.5) -> Ca
     return Camera(place, np.round(target, 1), target, heading_rad=heading_rad, aspect=aspect)
 
 
-def step_back(eye: Camera, aspect: float) -> Camera:
-    """A camera that holds the same in a view of another width by height."""
-    farther = max(eye.aspect / aspect, 1.0)
-    return replace(eye, place_m=eye.target_m + farther * (eye.place_m - eye.target_m))
-
-
 def _look(heading_rad: float, down_rad: float = ABOVE_RAD) -> Float:
     """(3,) the direction of view with a heading that is up in the picture, downwards by an angle."""
     towards = np.array([np.cos(heading_rad), np.sin(heading_rad), -np.tan(down_rad)])

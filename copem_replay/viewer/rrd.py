@@ -30,6 +30,7 @@ from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_show
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
 from copem_replay.viewer.blueprint import (
+    LARGE_ASPECT,
     NEAR_BY,
     RecordingContent,
     build_blueprint,
@@ -39,6 +40,7 @@ from copem_replay.viewer.blueprint import (
 )
 from copem_replay.viewer.camera import (
     BESIDE_ASPECTS,
+    EYES,
     MovingPicture,
     camera_above,
     camera_following,
@@ -196,6 +198,9 @@ def _build_content(
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in objects}
     axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
     eye = camera_on_ego(replay, experiment, axes_s, view_aspect(experiment, configurations))
+    large = camera_on_ego(replay, experiment, axes_s, LARGE_ASPECT)
+    if eye.turns and eye.aspect != LARGE_ASPECT:
+        large = replace(large, path=(*EYES, "large"))
     aspect = BESIDE_ASPECTS[len(objects) > 1]
     eyes = [camera_following(replay, experiment, table, k, aspect) for k in objects[:NEAR_BY]]
     onset_s = float(episodes[objects[0]]["onset_s"].iloc[0]) if objects else 0.0
@@ -203,8 +208,9 @@ def _build_content(
     above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
     compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
-        replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units),
-        lists, tuple(dict.fromkeys(baselines.values())), shown.too_short, find_opening_s(experiment, compared),
+        replay, experiment, table, episodes, configurations, objects, axes_s, eye, large, eyes, above,
+        list(named_units), lists, tuple(dict.fromkeys(baselines.values())), shown.too_short,
+        find_opening_s(experiment, compared),
     )  # fmt: skip
 
 
@@ -236,8 +242,9 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
         out.live.send(lambda rec: rec.send_blueprint(build_blueprint(content), make_active=True))
     if file.picture is not None:
         write_moving_origin(out, replay, file.picture)
-    for eye in content.eyes:
-        write_moving_origin(out, replay, content.follow(eye))
+    for eye in (*content.eyes, content.large):
+        if eye.object_ix is not None and eye.path != content.eye.path:
+            write_moving_origin(out, replay, content.follow(eye))
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]

@@ -31,7 +31,6 @@ from copem_replay.viewer.camera import (
     camera_following,
     camera_on_ego,
     follow_episodes,
-    step_back,
     write_false_words,
     write_moving_origin,
 )
@@ -202,15 +201,6 @@ def test_the_picture_holds_the_ego_and_the_object_of_a_story_and_nothing_more(tm
     assert scales[10.0] == pytest.approx(60 / 36)
     assert scales[1.0] < scales[10.0] < scales[6.0] <= 180 / 36
     assert 0 < np.abs(np.diff([*scales.values()])).max() < 0.5, "in a tenth of a second"
-
-
-def test_a_view_that_is_less_wide_holds_the_same(tmp_path: Path) -> None:
-    _, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 10.0), "61": (0.0, 10.0)}, left_m=45.0)
-    [origin] = [origin for origin in origins(tmp_path / "x.rrd", eye) if origin[0] == pytest.approx(5.0)]
-    held = np.array([[0.0, 50.0, 0.0], [0.0, 80.0, 0.0], [-45.0, 50.0, 0.0]])
-    assert np.abs(picture(eye, origin, held, 0.45)).max() > 1
-    assert np.abs(picture(step_back(eye, 0.45), origin, held, 0.45)).max() < 0.8
-    assert step_back(eye, 2.0).place_m.tolist() == eye.place_m.tolist()
 
 
 def test_a_story_too_far_away_does_not_change_the_picture(tmp_path: Path) -> None:

@@ -587,6 +587,13 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
     assert other.application_id != held.application_id
 
 
+def test_the_large_scene_of_two_has_a_camera_of_its_own_beside_wide_views(made: Made, tmp_path: Path) -> None:
+    """With two configurations views of the overview are three times as wide as high; four are as it is."""
+    made.write(tmp_path / "x.rrd", run_tracks={name: made.run_tracks[name] for name in ("GT", "PEM", "pole")})
+    assert not list(chunks(made.path, "/world/eyes/large"))
+    assert len(rows(tmp_path / "x.rrd", "/world/eyes/large")) == len(rows(made.path, "/world/eyes/ego"))
+
+
 def test_two_writings_compare_equal_and_the_file_is_sound(made: Made, tmp_path: Path) -> None:
     made.write(tmp_path / "same.rrd")
     assert rerun("rrd", "compare", "--unordered", made.path, tmp_path / "same.rrd").returncode == 0
