@@ -30,6 +30,7 @@ BAR_PX = 36
 QUESTIONS = {
     "Overview": "crowded.png",
     "Who knew when": "who_knew_when.png",
+    "Side by side": "side_by_side.png",
     "Why not earlier": "why_not_earlier.png",
     "What each believes": "what_each_believes.png",
     "How far off": "how_far_off.png",

@@ -1,8 +1,8 @@
 """Colours and shapes of configurations by their place in the experiment, told apart by colour-blind readers.
 
 One room for the viewer, figures, report, player, film and the layout of Foxglove. A configuration that is added at the
-end changes no other one. The ground truth is grey and takes no place. `tools/palette.py` has searched for the palettes,
-and says what it asks of them; tests hold them against it.
+end changes no other one, unless both are shown and have one colour. The ground truth is grey and takes no place.
+`tools/palette.py` has searched for the palettes, and says what it asks of them; tests hold them against it.
 """
 
 from __future__ import annotations
@@ -51,10 +51,17 @@ def configuration_signs(
 
 
 def configuration_colours(
-    configurations: Iterable[str], truths: Collection[str], theme: Theme = "dark"
+    configurations: Iterable[str], truths: Collection[str], theme: Theme = "dark", shown: Iterable[str] = ()
 ) -> dict[str, Rgb]:
-    """The colours of `configuration_signs`."""
-    return {name: sign.colour for name, sign in configuration_signs(configurations, truths, theme).items()}
+    """The colours of `configuration_signs`; of those `shown` together a later one with a taken colour has another."""
+    colours = {name: sign.colour for name, sign in configuration_signs(configurations, truths, theme).items()}
+    placed = [name for name in shown if name not in truths]
+    taken = [colours[name] for name in placed]
+    free = [colour for colour in map(_read_colour, _PALETTES[theme].split()[1:]) if colour not in taken]
+    for k, name in enumerate(placed):
+        if free and taken[k] in taken[:k]:
+            colours[name] = free.pop(0)
+    return colours
 
 
 def _take_turn(place: int, count: int) -> int:

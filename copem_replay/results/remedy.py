@@ -38,7 +38,7 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
         for last in names
         for other in names
         if known_s[last] == last_s > known_s[other] + SAME_INSTANT_S
-        and (change := _describe_change(experiment, keys := _find_changed_keys(experiment, last, other), last, other))
+        and (change := _describe_change(experiment, keys := find_changed_keys(experiment, last, other), last, other))
     ]
     if not pairs:
         return ""
@@ -51,7 +51,8 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
     return f"What would help {last}: {change} ({best}): known {gain}."
 
 
-def _find_changed_keys(experiment: Experiment, last: str, other: str) -> list[str]:
+def find_changed_keys(experiment: Experiment, last: str, other: str) -> list[str]:
+    """Keys of configurations in which two of them differ."""
     return [key for key in _KEYS if _value_of(experiment, key, last) != _value_of(experiment, key, other)]
 
 

@@ -8,8 +8,9 @@ where the log is cut. It is listed as too short to judge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -114,6 +115,22 @@ def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) ->
             return float(times_s[k] + min(waits_s[k] / 2, AFTER_S))
     onsets_s = [float(rows["onset_s"].iloc[0]) for rows in by_object]
     return max(min(onsets_s) - BEFORE_S, 0.0) if onsets_s else None
+
+
+def pick_evenly(
+    ranked: Sequence[str], most: int, kept: Sequence[str] = (), colours: Mapping[str, object] = MappingProxyType({})
+) -> tuple[str, ...]:
+    """`kept`, and so many of the ranked names that they are `most`, evenly spaced, with the first and the last one.
+
+    Instead of one with a colour that is taken, the nearest one with another, if there is any.
+    """
+    picked, last = {name: colours.get(name, name) for name in kept}, len(ranked) - 1
+    places = np.rint(np.linspace(0, last, min(most - len(picked), last + 1)))
+    for place in sorted(places.tolist(), key=lambda place: min(place, last - place)):
+        left = [(colours.get(name, name), abs(k - place), name) for k, name in enumerate(ranked) if name not in picked]
+        colour, _, name = min(left, key=lambda one: (one[0] in picked.values(), one[1]))
+        picked[name] = colour
+    return (*kept, *(name for name in ranked if name in picked))
 
 
 def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episodes: pd.DataFrame) -> Float:

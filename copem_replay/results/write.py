@@ -124,7 +124,7 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         notes = write_mcap(
             path, here, run.replayed.replay.scene, run.replayed.run_tracks, table, run.manifest,
             find_family(recording), recording.window, truth,
-            colours=configuration_colours(run.every, truths),
+            colours=configuration_colours(run.every, truths, shown=run.replayed.experiment.configurations),
         )  # fmt: skip
         check_files_unchanged(stamps)
     return notes

@@ -11,6 +11,7 @@
 | `world/<configuration>/status_near` | the same words as in `status`, placed for the views of one object |
 | `world/<configuration>/marks`, `marks/from`, `marks/from/line` | where an object was first known, and how far away |
 | `world/eyes/ego`, `world/eyes/<object>` | origins of the views that follow ego or object |
+| `world/eyes/large` | the same of the scene with two configurations, where views of the overview are wide |
 | `world/eyes/ego/arrows` | shown objects that are outside the picture around the ego |
 | `world/eyes/ego/false/<configuration>` | where the nearest false entries are, in words or as arrows at the edge |
 | `lanes/<object>/<place>_<configuration>` | the object's status (`viewer/status.py`), a mark at the onset |

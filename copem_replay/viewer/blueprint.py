@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -14,9 +14,9 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.false_tracks import describe_false_tracks
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.status import to_nanoseconds
-from copem_replay.results.remedy import tell_what_helps
-from copem_replay.results.shown_objects import SHOWN_OBJECTS
-from copem_replay.viewer.camera import Camera
+from copem_replay.results.remedy import find_changed_keys, tell_what_helps
+from copem_replay.results.shown_objects import SHOWN_OBJECTS, pick_evenly
+from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
@@ -60,6 +60,8 @@ OVERVIEW, FEW = 4, 3
 """Most views of the overview, and the number from which they are in two columns: each at least 400 × 200 points."""
 OVERVIEW_SHARES = (2.1, 1.0)
 """Widths of the overview's views and of what is beside them."""
+LARGE_ASPECT = 1.5
+"""Width by height of one view in the place of the overview's, and of one of four there, in a window of 1280 × 720."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,11 @@ class RecordingContent:
     """What one file shows: a run, its configurations in order, and the shown objects, the most telling one first.
 
     `episodes`: rows of the table by object; `axes_s`: first and last second of each object's axis.
-    Camera `eye` follows the ego, if there is one, `eyes` the objects; `above` looks at the units, of which `named` have
-    names. `lists`: lists that units send by a link, by configuration. `too_short`: ids of objects too short to judge.
-    `opens_s`: the instant at which the recording opens. `counted`: rows of the table that count, of all passes;
-    `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that are known too briefly for
-    words in a lane. `of_one`: all configurations are of one experiment.
+    Camera `eye` follows the ego, if there is one, `large` too, in one large view, `eyes` the objects; `above` looks at
+    the units, of which `named` have names. `lists`: lists that units send by a link, by configuration. `too_short`: ids
+    of objects too short to judge. `opens_s`: the instant at which the recording opens. `counted`: rows of the table
+    that count, of all passes; `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that
+    are known too briefly for words in a lane. `of_one`: all configurations are of one experiment.
     """
 
     replay: Replay
@@ -82,6 +84,7 @@ class RecordingContent:
     objects: Sequence[int]
     axes_s: Mapping[int, tuple[float, float]]
     eye: Camera
+    large: Camera
     eyes: Sequence[Camera]
     above: Camera
     named: Sequence[str]
@@ -130,6 +133,12 @@ class RecordingContent:
             for name in self.configurations
         ]
         return "\n\n".join(["False tracks, about nobody, of this run, the longest first", *parts])
+
+    def follow(self, eye: Camera) -> MovingPicture:
+        """What a camera that moves shows, with the masts that have names: around one object, or the ego and all."""
+        stories = {k: span for k, span in self.axes_s.items() if eye.turns or k == eye.object_ix}
+        masts = {k: {name for of in self.configurations for name in self.named_masts(of, [k])} for k in stories}
+        return follow_episodes(self.replay, self.experiment, eye, stories, masts)
 
     def helps(self, object_ix: int) -> str:
         """What would help with an object; “” where configurations are of several experiments: PEMs may differ, too."""
@@ -187,18 +196,43 @@ def overview_page(content: RecordingContent) -> rrb.Container:
     views = list[rrb.View](tracks_views(content, choose_overview(content)))
     columns = 1 if len(views) < FEW else 2
     words: list[rrb.View] = [difference_view(DIFFERENCE_SHORT)]
-    if len(views) % columns:
-        views.append(legend_view())  # into the free cell
-    else:
-        words.append(legend_view())
+    (views if len(views) % columns else words).append(legend_view())  # into the free cell, if there is one
+    return _page_with_lanes(content, rrb.Grid(*views, grid_columns=columns), words, "Overview")
+
+
+def _page_with_lanes(
+    content: RecordingContent, scenes: rrb.View | rrb.Container, words: Sequence[rrb.View], name: str
+) -> rrb.Container:
+    """Scenes, beside them the lanes of each object in tabs, and views with words below."""
+    import rerun.blueprint as rrb
+
     lanes = [rrb.Tabs(*(lanes_view(content, k) for k in content.objects))] if content.objects else []
-    beside = [*lanes, rrb.Tabs(*words)]
-    return rrb.Horizontal(
-        rrb.Grid(*views, grid_columns=columns),
-        rrb.Vertical(*beside),
-        column_shares=list(OVERVIEW_SHARES),
-        name="Overview",
-    )
+    beside = rrb.Vertical(*lanes, rrb.Tabs(*words))
+    return rrb.Horizontal(scenes, beside, column_shares=list(OVERVIEW_SHARES), name=name)
+
+
+def side_by_side_page(content: RecordingContent, early: str, late: str) -> rrb.Container:
+    """Two configurations in one scene, `early` with solid boxes, `late` in outlines; beside it as in the overview."""
+    units = tuple(dict.fromkeys((*content.received(early), *content.received(late))))
+    scene = world_view(
+        content, late, f"Solid: {early} · outlines: {late} · grey: the truth", content.large, units=units, solid=early,
+        named=content.named_masts(early, content.objects) or content.named_masts(late, content.objects),
+    )  # fmt: skip
+    return _page_with_lanes(content, scene, [difference_view(DIFFERENCE_SHORT), legend_view()], "Side by side")
+
+
+def choose_pair(content: RecordingContent) -> tuple[str, ...]:
+    """The configurations of the scene with two: one that knows an object where the recording opens, and one that does
+    not yet. Of several pairs the first with fewest other keys; without a difference the first two; () for fewer.
+    """
+    names, opens_s = select_perceiving(content.experiment, content.configurations), content.opens_s
+    for k in content.objects:
+        rows = content.episodes[k]
+        known = set(rows.loc[rows["detection_s"] <= opens_s, "configuration"])
+        pairs = [(a, b) for a in names for b in names if a in known and b not in known]
+        if pairs:
+            return min(pairs, key=lambda pair: len(find_changed_keys(content.experiment, *pair)))
+    return tuple(names[:2]) if len(names) > 1 else ()
 
 
 def choose_overview(content: RecordingContent) -> list[str]:
@@ -216,8 +250,7 @@ def choose_overview(content: RecordingContent) -> list[str]:
     mean_s = after_s.groupby(rows["configuration"]).mean()
     baseline = next((name for name in content.baselines if name in perceiving), perceiving[0])
     ranked = sorted((name for name in perceiving if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
-    places = OVERVIEW - 1
-    chosen = {ranked[round(k * (len(ranked) - 1) / (places - 1))] for k in range(places)} | {baseline}
+    chosen = pick_evenly(ranked, OVERVIEW, [baseline])
     return [name for name in perceiving if name in chosen]
 
 
@@ -395,12 +428,13 @@ def count_columns(views: int) -> int:
 
 def world_view(
     content: RecordingContent, configuration: str, title: str, eye: Camera, *, units: Sequence[str],
-    fields: bool = False, marks: bool = False, named: Sequence[str] = (), quiet: bool = False,
+    fields: bool = False, marks: bool = False, named: Sequence[str] = (), quiet: bool = False, solid: str = "",
 ) -> rrb.Spatial3DView:  # fmt: skip
     """A view of truth and one configuration, with `units` as points and, with `fields`, their fields of view.
 
     `marks`: with the lasting lines to the places of objects at their detection. `named`: units with visible names.
-    `quiet`: these are the only labels.
+    `quiet`: these are the only labels. `solid`: another configuration in the same scene, without words: its boxes are
+    solid, and the others outlines.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -413,6 +447,13 @@ def world_view(
     near = not eye.turns and eye.object_ix is not None
     # Words of the other pictures would lie over bodies.
     contents += [f"- {part}/{words}" for words in (WORDS, NEAR_WORDS) if quiet or (words == WORDS) == near]
+    overrides: dict[Any, Any] = {make_entity_path("world", "units", unit): shown for unit in named}
+    if solid:
+        other, modes = make_entity_path("world", configuration_part(solid)), rr.components.FillMode
+        contents += [f"+ {other}/**", *(f"- {other}/{kind}" for kind in ("marks/**", WORDS, NEAR_WORDS))]
+        contents += [f"- {path}/covariance" for path in (part, other)]
+        overrides[f"{other}/boxes"] = rr.Boxes3D.from_fields(fill_mode=modes.Solid)
+        overrides[f"{part}/boxes"] = rr.Boxes3D.from_fields(fill_mode=modes.MajorWireframe)
     if eye.turns:
         on_edge = ["arrows"], ["false", configuration_part(configuration)]
         contents += [f"+ {make_entity_path(*eye.path, *entity)}" for entity in on_edge]
@@ -423,7 +464,7 @@ def world_view(
         eye_controls=rrb.EyeControls3D(
             position=eye.place_m.tolist(), look_target=eye.target_m.tolist(), eye_up=(0, 0, 1)
         ),
-        overrides={make_entity_path("world", "units", unit): shown for unit in named},
+        overrides=overrides,
         line_grid=False,
         background=GROUND,
     )
@@ -475,7 +516,8 @@ def build_blueprint(content: RecordingContent) -> rrb.Blueprint:
 
     pages = [overview_page(content)]
     if content.objects:
-        pages += [lanes_page(content), reasons_page(content)]
+        two = [side_by_side_page(content, *pair)] if (pair := choose_pair(content)) else []
+        pages += [lanes_page(content), *two, reasons_page(content)]
     pages += [tracks_page(content), errors_page(content)]
     if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
@@ -504,7 +546,7 @@ def digest_layout(content: RecordingContent) -> str:
     scene = content.replay.scene
     eyes = [
         (eye.place_m.tolist(), eye.target_m.tolist(), eye.object_ix)
-        for eye in (content.eye, *content.eyes, content.above)
+        for eye in (content.eye, content.large, *content.eyes, content.above)
     ]
     parts = (
         LAYOUT,
@@ -516,6 +558,7 @@ def digest_layout(content: RecordingContent) -> str:
         list(content.named),
         *content.selected_ns,
         content.baselines or None,
+        choose_pair(content),
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
         *(["map"] if content.with_map else []),
@@ -525,7 +568,7 @@ def digest_layout(content: RecordingContent) -> str:
 
 def view_aspect(experiment: Experiment, configurations: Sequence[str]) -> float:
     """Width by height of a view of the overview in a window of 1280 × 720: two views are one above the other."""
-    return 3.0 if len(select_perceiving(experiment, configurations)) == FEW - 1 else 1.5
+    return 3.0 if len(select_perceiving(experiment, configurations)) == FEW - 1 else LARGE_ASPECT
 
 
 def select_perceiving(experiment: Experiment, configurations: Sequence[str]) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.results.shown_objects import find_followed, interpolate_places
+from copem_replay.viewer.sensors import locate_unit
 from copem_replay.viewer.sink import (
     WORDS_COLOUR,
     RecordingSink,
@@ -26,8 +28,8 @@ from copem_replay.viewer.sink import (
 )
 
 EYES = ("world", "eyes")
-BESIDE_ASPECT = 1.7
-"""Width by height of two views beside each other, at least."""
+BESIDE_ASPECTS = 1.25, 1.7
+"""Width by height of three and of two views beside each other, at least."""
 TOGETHER_M = 60.0
 """Farthest unit that is in one picture with what it sees: from farther away people are a few pixels."""
 NEARBY_M = 100.0
@@ -38,15 +40,16 @@ ABOVE_RAD = np.deg2rad(78.0)
 """Downward angle of the camera on the ego and on the units: distances and fields of view are hardly foreshortened."""
 EYE_RAD, MARGIN_M = np.deg2rad(55.0), 2.5
 """The viewer's vertical field of view, and room around centres: half the length of a car."""
-CLOSE_M, LEAST_AWAY_M = (20.0, 38.0), 20.0
-"""Least and greatest distance from camera to target on one object, and the least from above. From farther away people
-are a few pixels."""
-WIDE_M, WIDEST_M, AHEAD_M = 60.0, 180.0, 20.0
-"""Width in view around the ego, the greatest one, and the distance ahead of the ego of its middle."""
+CLOSE_M = 20.0
+"""Least distance from camera to target."""
+LEAST_M, WIDE_M, WIDEST_M, AHEAD_M = 36.0, 60.0, 180.0, 20.0
+"""Width in view around the ego: the least one, that without a story, the greatest; how far ahead the middle is then."""
 SMOOTH_S, SOON_S = 1.0, 1.5
 """Time over which turns and widths are averaged, and how long before and after a story it is in view: no jerks."""
 EDGE, ARROW_NS = 0.85, 200_000_000
 """Where arrows are, as a share of the way from the middle to the edge of the picture; how often they are drawn."""
+INSIDE = 0.78
+"""Where bodies of a story are at most, as such a share: the words beside and below them are in the picture, too."""
 EDGE_WORDS = 0.4, 0.16
 """Width and height of words such as “61 → 144 m” by half the sides of a view of the overview at 1280 × 720."""
 NAMED_FALSE, BESIDE_M = 3, 2.5
@@ -90,7 +93,7 @@ def camera_on_ego(
         if np.isnan(own[0]):
             own = _own_states(replay, on)[1][:, 0]
         ahead = np.array([np.cos(own[3]), np.sin(own[3]), 0.0])
-        place = -WIDE_M / (2 * aspect * np.tan(EYE_RAD / 2)) * _axes(np.pi / 2)[0]
+        place = -LEAST_M / (2 * aspect * np.tan(EYE_RAD / 2)) * _look(np.pi / 2)
         at_m = own[:3] + AHEAD_M * ahead
         path = (*EYES, "ego")
         up_rad = float(own[3]) + np.pi / 2
@@ -123,17 +126,18 @@ def _story_places(replay: Replay, experiment: Experiment, stories: Mapping[int, 
 
 @dataclass(frozen=True)
 class MovingPicture:
-    """What a turning camera shows at the instants (K,): its middle on the ground, what is ahead there, how wide it is.
+    """What a camera that follows shows at the instants (K,): its middle, what is ahead in its frame, how wide it is.
 
-    `scale`: how many times `WIDE_M` it is wide, which holds every object during its story. `seen`: by shown object
-    where it is, (3, K) ahead, left and up of the middle; NaN while it is absent.
+    `scale`: how many times as wide as at least. `middle`: the picture's middle as seen from what it follows, (3, K)
+    ahead, left and up. `seen`: by shown object where it is in that frame; NaN while it is absent.
     """
 
     eye: Camera
     elapsed_ns: Int  # (K,) since the log's start
-    target: Float  # (3, K)
-    yaw_rad: Float  # (K,)
+    own: Float  # (3, K) on the ground at what it follows
+    yaw_rad: Float  # (K,) of its frame
     scale: Float  # (K,)
+    middle: Float
     seen: Mapping[int, Float]
 
     def frames_at(self, elapsed_ns: Int) -> Int:
@@ -142,45 +146,90 @@ class MovingPicture:
         return rows
 
     def locate(self, place_m: Float, frame: Int) -> Float:
-        """(3, R) ahead, left and up of the middle at instants `frame` (R,), of places (3, R) in the world."""
-        off, yaw_rad = place_m - self.target[:, frame], self.yaw_rad[frame]
-        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-        return np.stack([cos * off[0] + sin * off[1], cos * off[1] - sin * off[0], off[2]])
+        """(3, R) ahead, left and up of what it follows at instants `frame` (R,), of places (3, R) in the world."""
+        return _turn(place_m - self.own[:, frame], -self.yaw_rad[frame])
 
 
-def follow_ego(
-    replay: Replay, experiment: Experiment, eye: Camera, stories: Mapping[int, tuple[float, float]]
-) -> MovingPicture:
-    """What a turning camera shows; `stories`: as in `camera_on_ego`."""
+def _turn(place: Float, by_rad: Float) -> Float:
+    """Places (3, K) turned to the left."""
+    cos, sin = np.cos(by_rad), np.sin(by_rad)
+    return np.stack([cos * place[0] - sin * place[1], sin * place[0] + cos * place[1], place[2]])
+
+
+def follow_episodes(
+    replay: Replay, experiment: Experiment, eye: Camera, stories: Mapping[int, tuple[float, float]],
+    masts: Mapping[int, Collection[str]] = MappingProxyType({}),
+) -> MovingPicture:  # fmt: skip
+    """What a camera that follows shows: each object during its story, together with what it follows, the ego and units.
+
+    What hides an object is between them. Stories for which the picture would be wider than `WIDEST_M` are left out, the
+    first ones last. `stories`: as in `camera_on_ego`; `masts`: by object, units in the picture with it; these and the
+    ego are, if they are as near as `TOGETHER_M`.
+    """
     assert eye.object_ix is not None
     time_s, own = _own_states(replay, eye.object_ix)
-    elapsed_ns, yaw_rad = to_nanoseconds(time_s), _smooth(time_s, np.unwrap(own[3]))
-    elapsed_ns[:1] = 0  # before the ego comes, the camera waits where it will
-    ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))])
-    wide = np.ones(len(time_s))
-    turning, each = MovingPicture(eye, elapsed_ns, own[:3] + AHEAD_M * ahead, yaw_rad, wide, {}), np.arange(len(wide))
-    seen = {
-        k: turning.locate(
-            interpolate_places(replay.scene, replay.truth, experiment, np.full(len(time_s), k), time_s)[:3], each
-        )
-        for k in stories
-    }
-    return replace(turning, scale=_choose_scale(time_s, eye, seen, stories), seen=seen)
+    each, still, ego_ix = np.arange(len(time_s)), np.zeros(len(time_s)), find_followed(replay.scene, experiment)
+    yaw_rad = _smooth(time_s, np.unwrap(own[3])) if eye.turns else still
+    elapsed_ns = to_nanoseconds(time_s)
+    elapsed_ns[:1] = 0  # before what it follows comes, the camera waits where it will
+    picture = MovingPicture(eye, elapsed_ns, own[:3], yaw_rad, still, np.zeros((3, len(time_s))), {})
+
+    def locate(object_ix: int) -> Float:
+        number = np.full(len(time_s), object_ix)
+        return picture.locate(interpolate_places(replay.scene, replay.truth, experiment, number, time_s)[:3], each)
+
+    seen = {k: locate(k) for k in stories}
+    kept = [picture.middle]
+    for k, (first_s, last_s) in stories.items():
+        body = _hold_ends(seen[k])
+        others = [picture.locate(locate_unit(replay, experiment, name, time_s).T, each) for name in masts.get(k, ())]
+        others += [locate(ego_ix)] if ego_ix >= 0 else []
+        near = [np.where(np.hypot(*(at - body)[:2]) <= TOGETHER_M, at, np.nan) for at in others]
+        now = (time_s >= first_s - SOON_S) & (time_s <= last_s + SOON_S)
+        story = [np.where(now, at, np.nan) for at in (body, *near)]
+        fits = _fit_picture(eye, [*kept, *story])[1] * LEAST_M <= WIDEST_M
+        kept += [np.where(fits, at, np.nan) for at in story]
+    middle, scale = _fit_picture(eye, kept)
+    if eye.turns:
+        idle = np.isnan(kept[1:]).all(axis=(0, 1)) if stories else np.ones(len(time_s), dtype=np.bool_)
+        middle[0, idle], scale[idle] = AHEAD_M, WIDE_M / LEAST_M
+    middle, scale = np.stack([_smooth(time_s, axis) for axis in middle]), _smooth(time_s, scale)
+    return replace(picture, scale=scale, middle=middle, seen=seen)
+
+
+def _hold_ends(place: Float) -> Float:
+    """Places (3, K), where absent those next in time."""
+    there, every = np.flatnonzero(~np.isnan(place[0])), np.arange(place.shape[1])
+    return np.stack([np.interp(every, there, axis[there]) for axis in place]) if len(there) else place
+
+
+def _fit_picture(eye: Camera, places: Sequence[Float]) -> tuple[Float, Float]:
+    """The middle (3, K) of a picture that holds places (3, K) each, and its scale (K,); NaN: nothing is held."""
+    away_m, every = float(np.linalg.norm(eye.place_m)), np.stack(places, axis=1)
+    towards = -eye.place_m / away_m
+    _, right, up = _axes(towards)
+    over = np.array([up[0], up[1], 0.0]) / np.hypot(up[0], up[1])
+    middle = np.zeros((3, every.shape[2]))
+    for way in (right, over):
+        along = np.tensordot(way, every, 1)
+        middle += way[:, None] * (np.nanmin(along, axis=0) + np.nanmax(along, axis=0)) / 2
+    off = ((every - middle[:, None]) / INSIDE).reshape(3, -1)
+    needed_m = np.nanmax(_fitting_distances(off, towards, eye.aspect).reshape(every.shape[1:]), axis=0)
+    return middle, np.maximum(needed_m / away_m, 1.0)
 
 
 def write_moving_origin(out: RecordingSink, replay: Replay, picture: MovingPicture) -> None:
-    """Write the entity that a turning camera follows, and an arrow for each shown object that is out of the picture.
+    """Write the entity that a camera follows; if it turns, an arrow for each shown object that is out of the picture.
 
     The origin has the picture's scale. Arrows say how far an object is from the ego: “61 → 44 m”.
     """
     import rerun as rr
 
-    origin = rr.Transform3D.columns(
-        translation=stack_float32(*picture.target), rotation_axis_angle=upright_turns(picture.yaw_rad),
-        scale=stack_float32(*[picture.scale] * 3),
-    )  # fmt: skip
+    target = stack_float32(*(picture.own + _turn(picture.middle, picture.yaw_rad)))
+    turn = {"rotation_axis_angle": upright_turns(picture.yaw_rad)} if picture.eye.turns else {}
+    origin = rr.Transform3D.columns(translation=target, scale=stack_float32(*[picture.scale] * 3), **turn)
     out.columns(picture.eye.path, picture.elapsed_ns, origin)
-    if picture.seen:
+    if picture.seen and picture.eye.turns:
         _write_arrows(out, replay, picture)
 
 
@@ -207,30 +256,16 @@ def _smooth(time_s: Float, values: Float) -> Float:
     return (until(time_s + SMOOTH_S / 2) - until(time_s - SMOOTH_S / 2)) / SMOOTH_S
 
 
-def _choose_scale(
-    time_s: Float, eye: Camera, seen: Mapping[int, Float], stories: Mapping[int, tuple[float, float]]
-) -> Float:
-    """(K,) how many times `WIDE_M` the picture is wide: smooth, and enough for each object during its story."""
-    needed = np.ones(len(time_s))
-    for k, place in seen.items():
-        away_m = _fitting_distances(place / EDGE, np.pi / 2, eye.aspect)  # the words beside it are in the picture, too
-        far = np.nan_to_num(away_m / float(np.linalg.norm(eye.place_m)))
-        needed = np.maximum(needed, np.where((time_s >= stories[k][0]) & (time_s <= stories[k][1]), far, 1.0))
-    needed = np.minimum(needed, WIDEST_M / WIDE_M)
-    begin, end = (np.searchsorted(time_s, time_s + side * SOON_S, "left" if side < 0 else "right") for side in (-1, 1))
-    held = np.array([needed[a:b].max() for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
-    return _smooth(time_s, held)
-
-
 def _write_arrows(out: RecordingSink, replay: Replay, picture: MovingPicture) -> None:
     """Write a point with an arrow near the edge of the picture, on the ground, for each object outside it.
 
     Objects farther from the ego than `WIDEST_M` have none: their names would cover those of nearer ones.
     """
     place = np.stack([*picture.seen.values()], axis=1)  # (3, M, K)
+    distance_m = np.hypot(place[0], place[1])
+    place = place - picture.middle[:, None]
     far_out = np.abs(_project(place / picture.scale, picture.eye)).max(axis=0)
     _, step = np.unique(picture.elapsed_ns // ARROW_NS, return_index=True)
-    distance_m = np.hypot(place[0] + AHEAD_M, place[1])
     row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
     at = m, step[row]
     spots, sides = _move_to_edge(place[:, *at] / picture.scale[step[row]], picture.eye, row)
@@ -250,7 +285,7 @@ def _move_to_edge(place: Float, eye: Camera, row: Int) -> tuple[Float, Sequence[
     u, v = EDGE * across / far_out, EDGE * high / far_out
     sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
     _spread_words(u, v, row)
-    towards, right, up = _axes(np.pi / 2)
+    towards, right, up = _axes(_look(np.pi / 2))
     tall = np.tan(EYE_RAD / 2)
     ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
     return eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray, sides.tolist()
@@ -292,11 +327,11 @@ def write_false_words(
     row = np.repeat(np.arange(len(counts)), counts)
     frame = picture.frames_at(elapsed_ns[row])
     place = picture.locate(place_m, frame)
-    ahead_m, left_m = place[0] + AHEAD_M, place[1]
+    ahead_m, left_m = place[:2]
     distance_m = np.hypot(ahead_m, left_m)
     order = np.lexsort((distance_m, row))
     order = order[(np.arange(len(row)) - np.searchsorted(row, row) < NAMED_FALSE) & (distance_m[order] <= WIDEST_M)]
-    spots = place[:, order] / picture.scale[frame[order]]
+    spots = (place - picture.middle[:, frame])[:, order] / picture.scale[frame[order]]
     spots[1] -= BESIDE_M / picture.scale[frame[order]]
     outside = np.abs(_project(spots, picture.eye)).max(axis=0) > 1.0
     labels = [
@@ -329,90 +364,53 @@ def below_bodies(body: Mapping[str, Float], up_rad: Float) -> Float:
     return np.stack([body["x_m"] - np.cos(up_rad) * away_m, body["y_m"] - np.sin(up_rad) * away_m, ground_m])
 
 
-def camera_following(replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int) -> Camera:
-    """A camera that follows an object of the table, with the ego in view at the onset if `CLOSE_M` allows."""
-    scene = replay.scene
+def camera_following(
+    replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int, aspect: float
+) -> Camera:
+    """A camera that follows an object of the table, from the left of the ego's way at the onset: it runs across."""
+    scene, on = replay.scene, find_followed(replay.scene, experiment)
     onset_s = table["onset_s"][table["object_id"] == scene.object_ids[object_ix]].to_numpy(dtype=float)[:1]
-    target = interpolate_places(replay.scene, replay.truth, experiment, np.array([object_ix]), onset_s)[:3, 0]
-    on = find_followed(scene, experiment)
-    own = interpolate_places(replay.scene, replay.truth, experiment, np.array([max(on, 0)]), onset_s)[:, 0]
-    has_ego = on >= 0 and not np.isnan(own[0])
-    towards = _view_direction(own[3] if has_ego else 0.0)
-    away_m = float(np.clip(np.hypot(*(own - np.append(target, 0))[:2]) if has_ego else 0.0, *CLOSE_M))
+    both = np.array([object_ix, max(on, 0)]), np.repeat(onset_s, 2)
+    target, own = interpolate_places(scene, replay.truth, experiment, *both).T
+    up_rad = (float(own[3]) if on >= 0 and not np.isnan(own[0]) else 0.0) - TURNED_RAD
+    place = np.round(-CLOSE_M * _look(up_rad, DOWN_RAD), 1)
     path = (*EYES, entity_names(scene)[object_ix])
-    up_rad = float(np.arctan2(towards[1], towards[0]))
-    return Camera(
-        np.round(-away_m * towards, 1), np.zeros(3), np.nan_to_num(target), object_ix, path=path, heading_rad=up_rad
-    )
-
-
-def include_places(eye: Camera, places_m: Float) -> Camera:
-    """A camera that looks between its object and the places (3, K) around it, from where all of them are seen.
-
-    `places_m`: relative to the object. Places farther away than `TOGETHER_M` are left out.
-    """
-    near = places_m[:, np.hypot(*places_m[:2]) <= TOGETHER_M]
-    if not near.size:
-        return eye
-    both = np.concatenate([np.zeros((3, 1)), near], axis=1)
-    middle = (both.min(axis=1) + both.max(axis=1)) / 2
-    back = eye.place_m / np.linalg.norm(eye.place_m)
-    right = np.array([-back[1], back[0], 0.0]) / np.hypot(*back[:2])
-    off, tall = both - middle[:, None], np.tan(EYE_RAD / 2)
-    beside, above = np.abs(right @ off) / (BESIDE_ASPECT * tall), np.abs(np.cross(back, right) @ off) / tall
-    needed_m = (np.maximum(beside, above) + MARGIN_M / tall + back @ off).max()
-    away_m = max(CLOSE_M[0], float(needed_m))
-    return replace(eye, place_m=np.round(middle + away_m * back, 1), target_m=np.round(middle, 1))
+    return Camera(place, np.zeros(3), np.nan_to_num(target[:3]), object_ix, path, False, up_rad, aspect)
 
 
 def camera_above(places_m: Float, heading_rad: float, aspect: float = 1.5) -> Camera:
     """A camera that looks down on places (3, K), in a direction that is up in the picture; it follows nothing."""
-    towards, right, _ = _axes(heading_rad)
+    towards, right, _ = _axes(_look(heading_rad))
     forward = np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
     middle = [(way @ places_m).min() / 2 + (way @ places_m).max() / 2 for way in (right, forward)]
     target = middle[0] * right + middle[1] * forward + [0.0, 0.0, places_m[2].mean()]
-    away_m = max(float(_fitting_distances(places_m - target[:, None], heading_rad, aspect).max()), LEAST_AWAY_M)
-    return Camera(np.round(target - away_m * towards, 1), np.round(target, 1), target, heading_rad=heading_rad)
+    away_m = max(float(_fitting_distances(places_m - target[:, None], towards, aspect).max()), CLOSE_M)
+    place = np.round(target - away_m * towards, 1)
+    return Camera(place, np.round(target, 1), target, heading_rad=heading_rad, aspect=aspect)
 
 
-def write_camera_origin(out: RecordingSink, replay: Replay, eye: Camera) -> None:
-    """Write the entity that a near camera follows: on the ground at the object, not rotated."""
-    import rerun as rr
-
-    assert eye.object_ix is not None
-    time_s, own = _own_states(replay, eye.object_ix)
-    elapsed, place = to_nanoseconds(time_s), stack_float32(*own[:3])
-    if elapsed[0] > 0:  # before the object comes, the camera waits where it will
-        elapsed, place = np.append(0, elapsed), np.concatenate([place[:1], place])
-    out.columns(eye.path, elapsed, rr.Transform3D.columns(translation=place))
+def _look(heading_rad: float, down_rad: float = ABOVE_RAD) -> Float:
+    """(3,) the direction of view with a heading that is up in the picture, downwards by an angle."""
+    towards = np.array([np.cos(heading_rad), np.sin(heading_rad), -np.tan(down_rad)])
+    return np.asarray(towards / np.linalg.norm(towards))
 
 
-def _view_direction(yaw_rad: float) -> Float:
-    """(3,) the direction of view, down and from the ego's left: its path runs across the picture, which is wide."""
-    turned = yaw_rad - TURNED_RAD
-    ahead = np.array([np.cos(turned), np.sin(turned), -np.tan(DOWN_RAD)])
-    unit: Float = ahead / np.linalg.norm(ahead)
-    return unit
-
-
-def _axes(heading_rad: float) -> tuple[Float, Float, Float]:
-    """(3,) each: the direction of view from above, and what is right and up in the picture."""
-    towards = np.array([np.cos(heading_rad), np.sin(heading_rad), -np.tan(ABOVE_RAD)])
-    towards /= np.linalg.norm(towards)
-    right = np.array([np.sin(heading_rad), -np.cos(heading_rad), 0.0])
+def _axes(towards: Float) -> tuple[Float, Float, Float]:
+    """(3,) each: a direction of view, and what is right and up in its picture."""
+    right = np.array([towards[1], -towards[0], 0.0]) / np.hypot(*towards[:2])
     return towards, right, np.cross(right, towards)
 
 
 def _project(place_m: Float, eye: Camera) -> Float:
     """(2, …) where places (3, …) relative to the target of a turning camera are in its picture, −1 … 1: across, up."""
-    towards, right, up = (np.tensordot(axis, place_m, 1) for axis in _axes(np.pi / 2))
+    towards, right, up = (np.tensordot(axis, place_m, 1) for axis in _axes(_look(np.pi / 2)))
     depth_m = np.maximum(np.linalg.norm(eye.place_m) + towards, 1.0) * np.tan(EYE_RAD / 2)
     return np.stack([right / (depth_m * eye.aspect), up / depth_m])
 
 
-def _fitting_distances(place_m: Float, heading_rad: float, aspect: float) -> Float:
+def _fitting_distances(place_m: Float, towards: Float, aspect: float) -> Float:
     """(K,) least distance from the target from which each place (3, K), relative to it, is in the picture."""
-    towards, right, up = _axes(heading_rad)
+    _, right, up = _axes(towards)
     beside = (np.abs(right @ place_m) + MARGIN_M) / (aspect * np.tan(EYE_RAD / 2))
     above = (np.abs(up @ place_m) + MARGIN_M) / np.tan(EYE_RAD / 2)
     needed: Float = np.maximum(beside, above) - towards @ place_m

@@ -30,16 +30,22 @@ from copem_replay.pipeline.status import EpisodeClocks, compute_status, read_epi
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
-from copem_replay.viewer.blueprint import NEAR_BY, RecordingContent, build_blueprint, digest_layout, view_aspect
+from copem_replay.viewer.blueprint import (
+    LARGE_ASPECT,
+    NEAR_BY,
+    RecordingContent,
+    build_blueprint,
+    digest_layout,
+    view_aspect,
+)
 from copem_replay.viewer.camera import (
+    BESIDE_ASPECTS,
+    EYES,
     MovingPicture,
     camera_above,
     camera_following,
     camera_on_ego,
     find_up_rad,
-    follow_ego,
-    include_places,
-    write_camera_origin,
     write_moving_origin,
 )
 from copem_replay.viewer.curves import write_differences
@@ -96,7 +102,7 @@ def write_rrd(
 
     More than seven configurations go into several files, such as `replay.configurations_8-14.rrd`; the ground truth is
     none of them, unless it is alone or compared. Colours depend on all of the experiment's configurations, also on
-    those that are not written.
+    those that are not written; those of a file differ.
 
     `run_tracks`: by time chunk, the receiver's fused tracks of each configuration in this run, with a frame per issued
     list (one unit, values (1, P)). `table`: the rows of `detections.parquet` of this log and run. `summary`: over all
@@ -126,7 +132,8 @@ def write_rrd(
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            by_name = colours or configuration_colours(experiment.configurations, truths)
+            every = experiment.configurations
+            by_name = colours or configuration_colours(every, truths, shown=part.configurations)
             files.append(_RecordingFile(out, content, {name: by_name[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baselines:  # of all objects at once: such a log is not long
@@ -169,10 +176,7 @@ class _RecordingFile:
     @cached_property
     def picture(self) -> MovingPicture | None:
         """What the camera on the ego shows; None: it stands still."""
-        content = self.content
-        if not content.eye.turns:
-            return None
-        return follow_ego(content.replay, content.experiment, content.eye, content.axes_s)
+        return self.content.follow(self.content.eye) if self.content.eye.turns else None
 
 
 def _build_content(
@@ -187,17 +191,19 @@ def _build_content(
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in objects}
     axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
     eye = camera_on_ego(replay, experiment, axes_s, view_aspect(experiment, configurations))
-    eyes = [
-        include_places(camera_following(replay, experiment, table, k), sensors.watching_places(replay, episodes[k]))
-        for k in objects[:NEAR_BY]
-    ]
+    large = camera_on_ego(replay, experiment, axes_s, LARGE_ASPECT)
+    if eye.turns and eye.aspect != LARGE_ASPECT:
+        large = replace(large, path=(*EYES, "large"))
+    aspect = BESIDE_ASPECTS[len(objects) > 1]
+    eyes = [camera_following(replay, experiment, table, k, aspect) for k in objects[:NEAR_BY]]
     onset_s = float(episodes[objects[0]]["onset_s"].iloc[0]) if objects else 0.0
     named_units = choose_named_units(replay, experiment, eye.at_m, onset_s)
     above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
     compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
-        replay, experiment, table, episodes, configurations, objects, axes_s, eye, eyes, above, list(named_units),
-        lists, tuple(dict.fromkeys(baselines.values())), shown.too_short, find_opening_s(experiment, compared),
+        replay, experiment, table, episodes, configurations, objects, axes_s, eye, large, eyes, above,
+        list(named_units), lists, tuple(dict.fromkeys(baselines.values())), shown.too_short,
+        find_opening_s(experiment, compared),
     )  # fmt: skip
 
 
@@ -229,8 +235,9 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
         out.live.send(lambda rec: rec.send_blueprint(build_blueprint(content), make_active=True))
     if file.picture is not None:
         write_moving_origin(out, replay, file.picture)
-    for eye in content.eyes:
-        write_camera_origin(out, replay, eye)
+    for eye in (*content.eyes, content.large):
+        if eye.object_ix is not None and eye.path != content.eye.path:
+            write_moving_origin(out, replay, content.follow(eye))
     _write_properties(out, content, run, run_is)
     out.static([], rr.ViewCoordinates.RIGHT_HAND_Z_UP, boxes.names_and_colours(scene))
     rows = content.table[content.table["configuration"].isin(list(content.configurations))]

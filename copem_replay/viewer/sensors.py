@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.interpolation import interpolate_states
-from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks, UnitFaults
+from copem_replay.core.tracks import Bool, Float, Int, Tracks, UnitFaults
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.sensor_poses import (
@@ -23,6 +22,7 @@ from copem_replay.perception.sensor_poses import (
     unit_ground,
 )
 from copem_replay.pipeline.prepare import Replay
+from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.viewer.sink import EGO, FIELD, RecordingSink, stack_float32
 
 if TYPE_CHECKING:
@@ -79,18 +79,8 @@ def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time
 
     A recorded unit has a name if the experiment says where it is.
     """
-    place = {}
-    for name, unit in experiment.units.items():
-        if unit.pem is None:
-            [at] = _locate_recorded_unit(replay, experiment, unit, np.array([time_s]))
-            if not np.isnan(at[0]):
-                place[name] = at
-            continue
-        poses = replay.placed.poses[name]
-        stamp = replay.scene.t0_ns + round(time_s * 1e9)
-        row = int(np.searchsorted(replay.placed.stamps_ns[name], stamp, side="right")) - 1
-        if row >= 0 and poses.present[row]:
-            place[name] = np.array([poses.x_m[row], poses.y_m[row], poses.z_m[row]])
+    every = {name: locate_unit(replay, experiment, name, np.array([time_s]))[0] for name in experiment.units}
+    place = {name: at for name, at in every.items() if not np.isnan(at[0])}
     order = sorted(place, key=lambda name: (experiment.units[name].on != "ego", np.hypot(*(place[name] - at_m)[:2])))
     chosen: dict[str, Float] = {}
     for name in order:
@@ -100,29 +90,17 @@ def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time
     return chosen
 
 
-def watching_places(replay: Replay, episodes: pd.DataFrame) -> Float:
-    """(3, K) places of the units that first listed an object, relative to it, at its onset and detections.
-
-    `episodes`: rows of one object and run. Of the ego, which may not have listed it, the place at the onset.
-    """
-    told = [(name, time_s) for name, time_s in zip(episodes["first_unit"], episodes["detection_s"], strict=True)]
-    onset_s, k = float(episodes["onset_s"].iloc[0]), replay.scene.object_number[episodes["object_id"].iloc[0]]
-    own = [name for name, unit in replay.expanded.modelled.items() if unit.on == "ego"]
-    asked = [(name, onset_s) for name in (*own[:1], *(name for name, _ in told))] + told
-    places = []
-    for name, time_s in dict.fromkeys(asked):
-        if name not in replay.expanded.modelled or np.isnan(time_s):
-            continue
-        poses, stamp = replay.placed.poses[name], replay.scene.t0_ns + round(time_s * 1e9)
-        row = int(np.searchsorted(replay.placed.stamps_ns[name], stamp, side="right")) - 1
-        states, there = interpolate_states(
-            replay.truth, np.array([k]), np.array([time_s]), t0_ns=replay.scene.t0_ns,
-            max_gap_s=replay.expanded.max_gap_s,
-        )  # fmt: skip
-        if row >= 0 and poses.present[row] and there[0]:
-            unit_m = np.array([poses.x_m[row], poses.y_m[row], poses.z_m[row]])
-            places.append(unit_m - [float(states[axis][0]) for axis in ("x_m", "y_m", "z_m")])
-    return np.array(places).reshape(-1, 3).T
+def locate_unit(replay: Replay, experiment: Experiment, name: str, time_s: Float) -> Float:
+    """(K, 3) places of a unit at times (K,), s, as of its newest list; NaN: there is none, or it is not known where."""
+    unit = experiment.units[name]
+    if unit.fuses is not None:  # it is where its first member is
+        return locate_unit(replay, experiment, unit.fuses[0], time_s)
+    if unit.recorded is not None:
+        return _locate_recorded_unit(replay, experiment, unit, time_s)
+    poses, stamps_ns = replay.placed.poses[name], replay.placed.stamps_ns[name]
+    row = np.searchsorted(stamps_ns, replay.scene.t0_ns + to_nanoseconds(time_s), side="right") - 1
+    places = np.concatenate([stack_float32(poses.x_m, poses.y_m, poses.z_m), np.full((1, 3), np.nan)])
+    return places[np.where((row >= 0) & np.append(poses.present, False)[row], row, -1)]
 
 
 def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
@@ -134,7 +112,7 @@ def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
             continue
         unit = experiment.units[name]
         if unit.pem is None:
-            place[frames] = _locate_recorded_unit(replay, experiment, unit, lists.captured_s[frames])
+            place[frames] = locate_unit(replay, experiment, name, lists.captured_s[frames])
             continue
         poses = replay.placed.poses[name]
         row = np.searchsorted(list_instants(replay.scene, replay.truth, unit), lists.stamp_ns[frames])
@@ -143,18 +121,8 @@ def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
 
 
 def _locate_recorded_unit(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
-    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either.
-
-    A unit that fuses is where its first member is.
-    """
+    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either."""
     place = np.full((len(time_s), 3), np.nan)
-    while unit.fuses is not None:
-        name, unit = unit.fuses[0], experiment.units[unit.fuses[0]]
-        if unit.pem is not None:
-            poses, stamps = replay.placed.poses[name], replay.placed.stamps_ns[name] - replay.scene.t0_ns
-            row = np.maximum(np.searchsorted(stamps * 1e-9, time_s + SAME_INSTANT_S, side="right") - 1, 0)
-            place[:] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)[row]
-            return place
     if unit.at is not None:
         ground_m = unit_ground(replay.truth, "", unit)
         place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))

@@ -98,3 +98,24 @@ def test_the_oracle_against_published_differences(
     one: tuple[float, ...], other: tuple[float, ...], expected: float
 ) -> None:
     assert ciede2000(one, other) == pytest.approx(expected, abs=1e-4)
+
+
+@given(st.lists(st.integers(0, 59), unique=True, max_size=7), st.integers(0, 59), st.sampled_from(THEMES))
+def test_seven_shown_together_differ_and_only_those_change_whose_colour_is_taken(
+    places: list[int], truth: int, theme: Theme
+) -> None:
+    shown, grey = [NAMES[k] for k in places], {NAMES[truth]}
+    of_all = configuration_colours(NAMES, grey, theme)
+    colours = configuration_colours(NAMES, grey, theme, shown)
+    mine = [colours[name] for name in shown if name not in grey]
+    assert len(set(mine)) == len(mine)
+    for k, name in enumerate(shown):
+        before = [of_all[other] for other in shown[:k] if other not in grey]
+        if of_all[name] not in before or name in grey:
+            assert colours[name] == of_all[name]
+        else:
+            assert colours[name] in configuration_colours(NAMES[1:9], (), theme).values()
+            assert colours[name] != configuration_colours(NAMES, (), theme)[NAMES[0]], "that of the first is its own"
+    assert {name: colours[name] for name in NAMES if name not in shown} == {
+        name: of_all[name] for name in NAMES if name not in shown
+    }

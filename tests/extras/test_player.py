@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,13 @@ def test_rows_are_those_of_the_newest_list_that_is_there() -> None:
     assert found.frame.tolist() == [1, 2]
     assert found.x_m.tolist() == [2.0, 1.0]
     assert found.object_ix.tolist() == [5, 5]
+
+
+def test_of_many_lanes_the_nearest_are_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player, "_MOST_LANE_POINTS", 5)
+    lines = tuple(np.array([[x, 0.0, 0.0], [x, 9.0, 0.0]]) for x in (300.0, 101.0, 102.0))
+    replayed = SimpleNamespace(replay=SimpleNamespace(lane_boundaries=lines))
+    assert player._list_lanes(replayed, GRID) == [[1.0, 0.0, 1.0, 9.0], [2.0, 0.0, 2.0, 9.0]]  # type: ignore[arg-type]
 
 
 def data_of(page: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ The scene of `tests/helpers/report_pages.py` with a wall of a lorry between the 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -14,10 +15,11 @@ import pytest
 
 import copem_replay as cr
 from copem_replay.core.errors import InputError
+from copem_replay.core.frame import Frame
 from copem_replay.extras.stories import story_facts
 from copem_replay.extras.stories.stories import choose_stories, story_parts
 from copem_replay.extras.stories.story_pictures import place_words
-from copem_replay.report.figures import FIGURES, Selection
+from copem_replay.report.figures import FIGURES, Selection, paths
 from copem_replay.report.figures.paths import average_unknown, late_paths_figure, read_drive
 from copem_replay.report.html.markup import drop_dead_links, join_html, link_story
 from copem_replay.report.html.page import build_page
@@ -158,6 +160,14 @@ class TestLatePaths:
         assert times["late"] == pytest.approx([0.5, 0.5])
         assert times["hit"] == pytest.approx([1.8, 1.8])
         assert times["never"] == pytest.approx([4.5, 4.5])
+
+    @pytest.mark.parametrize(("yaw_rad", "said"), [(None, False), (0.0, True), (0.5, False)])
+    def test_north_is_up_where_a_place_says_so(self, yaw_rad: float | None, said: bool, results: Results) -> None:
+        drive = read_drive(results, results.provenance.logs[0].name)
+        frame = None if yaw_rad is None else Frame("EPSG:25832", (0.0, 0.0), yaw_rad)
+        drive = replace(drive, scene=replace(drive.scene, frame=frame))
+        rows = average_unknown(results, ["late"])
+        assert ("north is up" in paths._note_sentences(results, drive, rows, ["late"], ["late"])[0]) is said
 
     def test_of_the_truth_alone_there_is_none(self, results: Results) -> None:
         assert FIGURES["late_paths"].missing(results, Selection(("GT",))) == ""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import copem_replay as cr
@@ -27,9 +28,9 @@ from copem_replay.viewer.blueprint import select_perceiving, view_aspect
 from copem_replay.viewer.camera import (
     TOGETHER_M,
     Camera,
+    camera_following,
     camera_on_ego,
-    follow_ego,
-    include_places,
+    follow_episodes,
     write_false_words,
     write_moving_origin,
 )
@@ -62,20 +63,19 @@ def written(
     eye = camera_on_ego(replay, given, stories, aspect)
     if eye.object_ix is not None:
         with file_stream(path, "a", "b") as rec:
-            picture = follow_ego(replay, given, eye, stories)
+            picture = follow_episodes(replay, given, eye, stories)
             write_moving_origin(RecordingSink(rec, replay.scene.t0_ns), replay, picture)
     return eye
 
 
-def origins(path: Path, eye: Camera) -> list[tuple[float, Float, float, float]]:
+def origins(path: Path, eye: Camera, entity: str = "ego") -> list[tuple[float, Float, float, float]]:
     """Instant (s), place (3,), turn and scale of what the camera follows."""
     if eye.object_ix is None:
         return [(0.0, np.zeros(3), 0.0, 1.0)]
     found = []
-    for row in rows(path, "/world/eyes/ego"):
-        [place], [size], [turn] = (
-            row[f"Transform3D:{name}"] for name in ("translation", "scale", "rotation_axis_angle")
-        )
+    for row in rows(path, f"/world/eyes/{entity}"):
+        [place], [size] = (row[f"Transform3D:{name}"] for name in ("translation", "scale"))
+        [turn] = row.get("Transform3D:rotation_axis_angle", [{"axis": [0, 0, 1], "angle": 0.0}])
         assert size[0] == size[1] == size[2]
         assert turn["axis"] == [0, 0, 1]
         found.append((row["elapsed"] / 1e9, np.array(place), float(turn["angle"]), float(size[0])))
@@ -175,8 +175,8 @@ def follow(path: Path, stories: dict[str, tuple[float, float]], left_m: float = 
     return replay, written(path, replay, given, {numbers[name]: story for name, story in stories.items()})
 
 
-def test_sixty_metres_wide_twenty_ahead_and_turned_with_the_ego(tmp_path: Path) -> None:
-    _, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 10.0)})
+def test_sixty_metres_wide_twenty_ahead_and_turned_with_the_ego_without_a_story(tmp_path: Path) -> None:
+    _, eye = follow(tmp_path / "x.rrd", {})
     down = eye.target_m - eye.place_m
     assert 75 <= np.rad2deg(np.arctan2(-down[2], np.hypot(*down[:2]))) <= 80
     for origin in origins(tmp_path / "x.rrd", eye):
@@ -190,23 +190,29 @@ def test_sixty_metres_wide_twenty_ahead_and_turned_with_the_ego(tmp_path: Path) 
         assert 0.5 < left[1] < 1
 
 
-def test_the_picture_widens_for_the_story_of_a_far_object_and_only_then(tmp_path: Path) -> None:
-    _, eye = follow(tmp_path / "x.rrd", {"61": (4.0, 5.0)}, left_m=45.0)
-    scales = {
-        round(at, 1): (origin, scale) for origin in origins(tmp_path / "x.rrd", eye) for at, *_, scale in [origin]
-    }
-    assert [scales[at][1] for at in (0.0, 1.9, 7.1, 10.0)] == [1.0] * 4
-    for at in (4.0, 4.5, 5.0):
-        origin, scale = scales[at]
-        assert np.abs(picture(eye, origin, np.array([[-45.0, 50.0, 0.0]]))).max() <= 1
-        assert scale <= 180 / 60
-    steps = np.abs(np.diff([scale for _, scale in scales.values()]))
-    assert 0 < steps.max() < 0.3, "in a tenth of a second"
+def test_the_picture_holds_the_ego_and_the_object_of_a_story_and_nothing_more(tmp_path: Path) -> None:
+    """One 30 m ahead is seen from nearer than without a story, one 45 m to the left from farther away."""
+    _, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 2.0), "61": (6.0, 7.0)}, left_m=45.0)
+    found = {round(origin[0], 1): origin for origin in origins(tmp_path / "x.rrd", eye)}
+    for at, other in ((1.0, [0.0, 40.0, 0.0]), (6.0, [-45.0, 50.0, 0.0]), (7.0, [-45.0, 50.0, 0.0])):
+        both = picture(eye, found[at], np.array([[0.0, 10 * at, 0.0], other]))
+        assert 0.5 < np.abs(both).max(axis=1).min() <= np.abs(both).max() < 0.8, "as large as words beside it allow"
+    scales = {at: scale for at, (*_, scale) in found.items()}
+    assert scales[10.0] == pytest.approx(60 / 36)
+    assert scales[1.0] < scales[10.0] < scales[6.0] <= 180 / 36
+    assert 0 < np.abs(np.diff([*scales.values()])).max() < 0.5, "in a tenth of a second"
+
+
+def test_a_story_too_far_away_does_not_change_the_picture(tmp_path: Path) -> None:
+    """150 m beside the way is more than fits."""
+    _, eye = follow(tmp_path / "x.rrd", {"61": (4.0, 5.0)}, left_m=150.0)
+    scales = [scale for *_, scale in origins(tmp_path / "x.rrd", eye)]
+    assert scales == pytest.approx([60 / 36] * len(scales))
 
 
 def test_an_arrow_for_what_is_outside(tmp_path: Path) -> None:
     """100 m to the left of the ego's way: up in the picture. The car ahead is inside."""
-    _, eye = follow(tmp_path / "x.rrd", {"61": (-2.0, -1.0), "7": (0.0, 10.0)})
+    _, eye = follow(tmp_path / "x.rrd", {"61": (-9.0, -8.0), "7": (-9.0, -8.0)})
     found = {round(row["elapsed"] / 1e9, 1): row for row in rows(tmp_path / "x.rrd", "/world/eyes/ego/arrows")}
     assert found[0.0]["Points3D:labels"] == ["61 ↑ 112 m"], "√(100² + 50²)"
     assert found[5.0]["Points3D:labels"] == ["61 ↑ 100 m"]
@@ -222,7 +228,7 @@ def test_words_at_the_edge_are_apart(tmp_path: Path) -> None:
     cars = [Thing(name, "car", standing(-100 - 8 * k, 20)) for k, name in enumerate(("61", "62", "63"))]
     scene = recording([Thing("ego", "car", driving(0, 0, 0, 1), yaw_rad=np.pi / 2), *cars], until_s=4.0)
     given = experiment(configurations={"GT": {"units": "truth"}})
-    written(tmp_path / "x.rrd", prepare_log(scene, given), given, dict.fromkeys((1, 2, 3), (-2.0, -1.0)))
+    written(tmp_path / "x.rrd", prepare_log(scene, given), given, dict.fromkeys((1, 2, 3), (-9.0, -8.0)))
     eye = camera_on_ego(prepare_log(scene, given), given, {}, 1.5)
     for row in rows(tmp_path / "x.rrd", "/world/eyes/ego/arrows"):
         assert len(row["Points3D:labels"]) == 3
@@ -234,8 +240,8 @@ def test_words_at_the_edge_are_apart(tmp_path: Path) -> None:
 
 def test_the_nearest_false_entries_are_named_by_their_places(tmp_path: Path) -> None:
     """The ego drives north, at 10 m/s; in its second list there is nothing about no object."""
-    replay, eye = follow(tmp_path / "x.rrd", {"7": (0.0, 10.0)})
-    moving = follow_ego(replay, experiment(configurations={"GT": {"units": "truth"}}), eye, {})
+    replay, eye = follow(tmp_path / "x.rrd", {})
+    moving = follow_episodes(replay, experiment(configurations={"GT": {"units": "truth"}}), eye, {})
     entries = np.array([[-6, 34, 1], [3, 4, 1], [0, 61, 1], [70, 10, 1], [0, 200, 1]], dtype=float).T
     path = tmp_path / "y.rrd"
     with file_stream(path, "a", "b") as rec:
@@ -282,15 +288,31 @@ def test_without_an_ego_the_story_and_units_around_are_in_view_and_without_one_t
     assert select_perceiving(given, ["pole"]) == ["pole"]
 
 
-def test_a_near_view_holds_the_units_that_see_the_object() -> None:
-    """One 20 m behind and one 40 m beside it; one that is too far away changes nothing."""
-    near = Camera(np.array([-9.0, 0.0, 18.0]), np.zeros(3), np.zeros(3), 0)
-    origin = (0.0, np.zeros(3), 0.0, 1.0)
-    units = np.array([[-20.0, 0.0, 2.0], [0.0, 40.0, 6.0]])
-    assert np.abs(picture(near, origin, units, 1.7)).max() > 1
-    both = include_places(near, units.T)
-    assert np.abs(picture(both, origin, np.vstack([units, np.zeros((1, 3))]), 1.7)).max() < 1
-    far = np.array([[TOGETHER_M + 1, 0.0, 2.0]])
-    assert include_places(near, far.T) is near
-    beside = include_places(near, np.vstack([units, far]).T)
-    assert (beside.place_m.tolist(), beside.target_m.tolist()) == (both.place_m.tolist(), both.target_m.tolist())
+def test_a_near_view_holds_the_ego_and_masts_of_the_object_from_onset_to_detection(tmp_path: Path) -> None:
+    """A pole 40 m beside it, and the ego that comes from 50 m to 10 m; a pole that is too far away changes nothing."""
+    scene = recording(
+        [Thing("ego", "car", driving(-50, 0, 10, 0)), Thing("7", "pedestrian", standing(0, 0))], until_s=4.0
+    )
+    far_m = TOGETHER_M + 1
+    units = {
+        name: {"at": [x, y], "height_m": 6.0, "ground_z_m": 0.0, "pem": "sure"}
+        for name, (x, y) in {"pole": (0, 40), "far": (0, -far_m)}.items()
+    }
+    given = experiment(units=units, configurations={"both": {"units": ["pole", "far"]}})
+    replay = prepare_log(scene, given)
+    k = scene.scene.object_number["7"]
+    table = pd.DataFrame({"object_id": ["7"], "onset_s": [0.0]})
+    eye = camera_following(replay, given, table, k, 1.7)
+    path = tmp_path / "x.rrd"
+    with file_stream(path, "a", "b") as rec:
+        moving = follow_episodes(replay, given, eye, {k: (0.0, 4.0)}, {k: ["pole", "far"]})
+        write_moving_origin(RecordingSink(rec, 0), replay, moving)
+    scales = []
+    for origin in origins(path, eye, "7_pedestrian"):
+        held = np.array([[-50 + 10 * origin[0], 0, 0.75], [0, 0, 0.75], [0, 40, 6]])
+        assert np.abs(picture(eye, origin, held, 1.7)).max() < 0.85
+        assert np.abs(picture(eye, origin, np.array([[0.0, -far_m, 6.0]]), 1.7)).max() > 1
+        assert origin[2] == 0.0, "it does not turn"
+        scales.append(origin[3])
+    assert len(scales) > 30
+    assert scales[0] > 1.1 * scales[-1] >= 1.1, "as near as the ego allows"

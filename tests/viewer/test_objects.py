@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -10,7 +11,8 @@ import pytest
 
 from copem_replay.experiment.schema import Experiment
 from copem_replay.pipeline.prepare import Replay, prepare_log
-from copem_replay.results.shown_objects import choose_shown_objects, find_opening_s
+from copem_replay.results.shown_objects import choose_shown_objects, find_opening_s, pick_evenly
+from copem_replay.viewer.blueprint import choose_pair
 from copem_replay.viewer.events import _describe_others
 from tests.helpers.scenes import Thing, driving, experiment, recording, standing
 from tests.viewer.test_rrd import make, static
@@ -125,6 +127,60 @@ def test_it_opens_while_some_know_and_others_do_not() -> None:
     assert find_opening_s(asked, [table(("a", 3.0, 9.0, None, 4.0))]) == pytest.approx(4.5), "one never"
     assert find_opening_s(asked, [alike]) == pytest.approx(1.5), "no difference: just before the onset"
     assert find_opening_s(asked, []) is None
+
+
+@pytest.mark.parametrize(
+    ("colours", "kept", "picked"),
+    [
+        ({}, (), "adgj"),
+        ({}, ("x",), "xaej"),
+        ({"d": 1, "g": 1}, (), "adfj"),
+        ({"a": 1, "j": 1, "i": 1}, (), "adgh"),
+        (dict.fromkeys("abcdefghij", 1), (), "adgj"),
+        ({"x": 1, "a": 1}, ("x",), "xbej"),
+    ],
+)
+def test_names_are_picked_evenly_with_colours_that_differ(
+    colours: dict[str, int], kept: tuple[str, ...], picked: str
+) -> None:
+    """The nearest one with another colour instead of one whose colour is taken; the first and the last one first."""
+    assert "".join(pick_evenly(list("abcdefghij"), 4, kept, colours)) == picked
+
+
+@pytest.mark.parametrize(
+    ("detections_s", "pair"),
+    [
+        ({"ideal": 2.0, "gnn": 2.0, "alone": 4.0, "late": 2.5}, ("gnn", "alone")),
+        ({"ideal": 2.0, "gnn": 2.0, "alone": 2.0, "late": None}, ("gnn", "late")),
+        ({"ideal": 2.0, "gnn": None, "alone": None, "late": None}, ("ideal", "gnn")),
+        ({"ideal": 2.0, "gnn": 2.0, "alone": 2.0, "late": 2.0}, ("ideal", "gnn")),
+        ({"alone": 2.0}, ()),
+    ],
+)
+def test_the_scene_with_two_has_what_differs_where_it_opens_by_fewest_keys(
+    detections_s: dict[str, float | None], pair: tuple[str, ...]
+) -> None:
+    """It opens at 3.0 s; the first object is known alike. `gnn` and `alone` differ in units, `late` in its latency."""
+    gnn = {"units": ["ego", "pole"], "fusion": {"kind": "gnn"}}
+    asked = experiment(
+        units={"pole": {"at": [20, -10], "height_m": 6.0, "ground_z_m": 0.0, "pem": "sure"}},
+        configurations={
+            "GT": {"units": "truth"}, "ideal": {"units": ["ego", "pole"]},
+            "gnn": gnn, "alone": gnn | {"units": ["ego"]}, "late": gnn | {"latency_s": 0.5},
+        },
+    )  # fmt: skip
+    alike, apart = (
+        pd.DataFrame({"configuration": list(of), "detection_s": pd.Series(list(of.values()), dtype=float)})
+        for of in (dict.fromkeys(detections_s, 1.0), detections_s)
+    )
+    content = SimpleNamespace(
+        experiment=asked,
+        configurations=["GT", *detections_s],
+        opens_s=3.0,
+        objects=[1, 2],
+        episodes={1: alike, 2: apart},
+    )
+    assert choose_pair(content) == pair  # type: ignore[arg-type]
 
 
 def test_what_is_too_short_is_listed(tmp_path: Path) -> None:

@@ -29,11 +29,10 @@ from copem_replay.pipeline.status import EARLY, KNOWN, STATUSES
 from copem_replay.results.shown_objects import axis_s, choose_shown_objects
 from copem_replay.viewer import sink as palette
 from copem_replay.viewer import write_rrd
-from copem_replay.viewer.camera import camera_following, camera_on_ego, include_places
+from copem_replay.viewer.camera import camera_following, camera_on_ego
 from copem_replay.viewer.curves import break_lines, running_median
 from copem_replay.viewer.lanes import _shorten_words, lanes_axis_s
-from copem_replay.viewer.sensors import watching_places
-from copem_replay.viewer.sink import show_seconds
+from copem_replay.viewer.sink import entity_names, show_seconds
 from tests.helpers.report_pages import named
 from tests.helpers.scenes import Thing, recording, standing
 from tests.oracles.colour import apart_for_a_deuteranope, ciede2000, contrast, lab, linear
@@ -251,10 +250,8 @@ def test_words_of_status_are_below_the_boxes_they_name(city: Made) -> None:
     stories = {k: axis_s(of, city.replay.scene.end_s) for k, of in episodes.items()}
     around = camera_on_ego(city.replay, city.given, stories, aspect=1.5)
     moving = {round(origin[0], 3): origin for origin in origins(city.path, around)}
-    near = {
-        k: include_places(camera_following(city.replay, city.given, city.table, k), watching_places(city.replay, of))
-        for k, of in episodes.items()
-    }
+    near = {k: camera_following(city.replay, city.given, city.table, k, 1.7) for k in shown}
+    beside = {k: origins(city.path, eye, entity_names(city.replay.scene)[k]) for k, eye in near.items()}
     times_s = [round(captured_s, 3) for captured_s in truth.row_captured_s.tolist()]
     row_of = dict(zip(zip(times_s, truth.row_object_ix.tolist(), strict=True), range(len(times_s)), strict=True))
     held = {"status": 0, "status_near": 0}
@@ -267,10 +264,9 @@ def test_words_of_status_are_below_the_boxes_they_name(city: Made) -> None:
                 k = numbers[label.split(" ")[0]]
                 if (row := row_of.get((at_s, k))) is None:  # between frames of the truth
                     continue
-                ground = np.array(
-                    [truth.x_m[0, row], truth.y_m[0, row], truth.z_m[0, row] - truth.height_m[0, row] / 2]
-                )
-                eye, origin = (around, moving[at_s]) if entity == "status" else (near[k], (at_s, ground, 0.0, 1.0))
+                eye, origin = (around, moving[at_s]) if entity == "status" else (
+                    near[k], [origin for origin in beside[k] if origin[0] < at_s + 1e-3][-1]
+                )  # fmt: skip
                 box, [word] = (picture(eye, origin, at_m) for at_m in (corners(city.replay, row), np.array([place])))
                 if np.abs(box).max() > 1:
                     continue

@@ -126,7 +126,7 @@ def write_film(
     replayed, rows = replay_again(read, choice.log, choice.run, read.experiment.configurations)
     table = first_episodes(rows)
     read.check_unchanged()
-    every = configuration_colours(read.experiment.configurations, find_truths(read), "light")
+    every = configuration_colours(read.experiment.configurations, find_truths(read), "light", choice.configurations)
     colours = {name: every[name] for name in choice.configurations}
     return draw_film(path, replayed, table, choice.object_id, colours, read.place)
 

@@ -86,7 +86,8 @@ def _find_colours(experiment: str, names: Sequence[str]) -> dict[str, str]:
         truths = {name for name, keys in asked.items() if keys.get("units") == TRUTH}
     except (NotYamlError, AttributeError, TypeError, ValueError, KeyError):
         asked, truths = {}, set()
-    colours = configuration_colours(asked if set(names) <= set(asked) else names, truths)
+    asked = asked if set(names) <= set(asked) else dict.fromkeys(names)
+    colours = configuration_colours(asked, truths, shown=[name for name in asked if name in names])
     return {name: "#{:02x}{:02x}{:02x}".format(*colours[name]) for name in names}
 
 

@@ -91,8 +91,9 @@
 
   const world = (pen, seen, tone) => {
     pen.lineWidth = 1;
-    pen.fillStyle = pen.strokeStyle = tone("--line");
-    pen.globalAlpha = 0.4;
+    pen.fillStyle = tone("--line");
+    pen.strokeStyle = tone("--edge");
+    pen.globalAlpha = 0.5;
     for (const lane of data.lanes) {
       pen.beginPath();
       for (let k = 0; k < lane.length; k += 2) pen.lineTo(...seen.at(lane[k], lane[k + 1]));
@@ -104,7 +105,6 @@
       for (let k = 0; k < solid.length; k += 2) pen.lineTo(...seen.at(solid[k], solid[k + 1]));
       pen.fill();
     }
-    pen.strokeStyle = tone("--edge");
     pen.fillStyle = tone("--faint");
     for (const k of truth.keys()) {
       const where = place(truth, k, frame), [, , length, width] = data.objects[k];

@@ -129,7 +129,8 @@ def write_section(study: ReportData) -> tuple[str, list[Html]] | None:
 def player_element(study: ReportData) -> Html | None:
     """The player of a run with its data; words where the log cannot be replayed again; None where no run is shown."""
     results, shown = study.results, study.results.provenance.run_shown
-    names = find_differing(results, study.contenders, MOST_CONFIGURATIONS)
+    colours = {name: look.dark for name, look in study.looks.items()}
+    names = find_differing(results, study.contenders, MOST_CONFIGURATIONS, colours)
     if not shown or not names or not len(results.known):
         return None
     try:
@@ -255,15 +256,15 @@ def _outline_solids(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
 
 
 _MOST_LANE_POINTS = 20_000
-"""Of borders of lanes on a page, some 200 kB; with more they are left out."""
+"""Of borders of lanes on a page, some 200 kB; of more, those nearest to the middle."""
 
 
 def _list_lanes(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
     """Borders of lanes as x and y in turn, m from the middle."""
-    lines = replayed.replay.lane_boundaries
-    if sum(map(len, lines)) > _MOST_LANE_POINTS:
-        return []
-    return [(line[:, :2] - grid.middle_m).round(1).ravel().tolist() for line in lines]
+    lines = [line[:, :2] - grid.middle_m for line in replayed.replay.lane_boundaries]
+    lines.sort(key=lambda line: float(np.hypot(*line.T).min()))
+    kept = np.searchsorted(np.cumsum([len(line) for line in lines]), _MOST_LANE_POINTS, side="right")
+    return [line.round(1).ravel().tolist() for line in lines[:kept]]
 
 
 def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:

@@ -18,8 +18,8 @@ from copem_replay.extras.stories.story_facts import (
 from copem_replay.perception.sight import HIDDEN, IN_SIGHT
 from copem_replay.perception.visibility import box_corners
 from copem_replay.pipeline.sight import StatusSpan
-from copem_replay.report.figures.selection import pick_evenly
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
+from copem_replay.results.shown_objects import pick_evenly
 
 JUDGED_S = 2.0
 """Least length of the lanes."""

@@ -243,8 +243,9 @@ def _note_sentences(
     never = (
         f"; ✕: never known in {100 * NEVER_FROM:.0f} % of the {runs} runs or more" if runs > 1 else "; ✕: never known"
     )
+    north = ", north is up" if drive.scene.frame is not None and not drive.scene.frame.yaw_rad else ""
     return [
-        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}, north is up",
+        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}{north}",
         "Grey: before the onset; thick: unknown since the onset; thin: afterwards, in the colour of the time that it "
         f"took; darker is later{never}",
         *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pandas as pd
 
+from copem_replay.core.colours import Rgb, configuration_colours
 from copem_replay.core.errors import CopemError, InputError
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.onset import COUNTS_BY
 from copem_replay.metrics.summary import DETECTED
-from copem_replay.report.figures.style import shorten_names, sort_soonest_first
+from copem_replay.report.figures.style import find_truths, shorten_names, sort_soonest_first
 from copem_replay.results.compare.labels import find_baseline
-from copem_replay.results.shown_objects import choose_shown_objects, measure_apart
+from copem_replay.results.shown_objects import choose_shown_objects, measure_apart, pick_evenly
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
@@ -91,7 +92,11 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
     shown = (
         present_names
         if selection.configurations
-        else pick_best_to_worst(rows[rows["object_id"] == object_id], present_names)
+        else pick_best_to_worst(
+            rows[rows["object_id"] == object_id],
+            present_names,
+            configuration_colours(results.experiment.configurations, find_truths(results)),
+        )
     )
     return Choice(log, object_id, run, shown, bool(selection.configurations))
 
@@ -134,11 +139,13 @@ def _find_most_telling(results: Results, of_run: pd.DataFrame) -> tuple[str, str
     return log, recording.scene.object_ids[shown.object_ix[0]]
 
 
-def find_differing(results: Results, names: Sequence[str], most: int = MOST_LINES) -> tuple[str, ...]:
+def find_differing(
+    results: Results, names: Sequence[str], most: int = MOST_LINES, colours: Mapping[str, object] = MappingProxyType({})
+) -> tuple[str, ...]:
     """Up to `most` configurations in their order: all, or the first ones of those with equal times to detection.
 
-    If these are still too many, they are picked evenly from the soonest to the latest. The baseline is always among
-    them.
+    If these are still too many, they are picked evenly from the soonest to the latest, with `colours` that differ. The
+    baseline is always among them.
     """
     if len(names) <= most:
         return tuple(names)
@@ -151,7 +158,7 @@ def find_differing(results: Results, names: Sequence[str], most: int = MOST_LINE
     for name in (baseline, *digests):
         first.setdefault(digests[name].digest(), name)
     others = [name for name in first.values() if name != baseline]
-    kept = {baseline, *pick_evenly(sort_soonest_first(results, others), most - 1)}
+    kept = pick_evenly(sort_soonest_first(results, others), most, [baseline], colours)
     return tuple(name for name in names if name in kept)
 
 
@@ -163,12 +170,6 @@ def pivot_by_run(results: Results, column: str) -> Iterator[pd.DataFrame]:
         yield times.reindex(columns=list(results.experiment.configurations))
 
 
-def pick_evenly(ranked: Sequence[str], most: int) -> tuple[str, ...]:
-    """Up to `most` of the names, evenly spaced, with the first and the last."""
-    picked = np.unique(np.rint(np.linspace(0, len(ranked) - 1, min(most, len(ranked)))).astype(int))
-    return tuple(ranked[k] for k in picked)
-
-
 def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
     """A sentence on the configurations that a figure leaves out; empty without any."""
     left = [short for name, short in shorten_names(names).items() if name not in shown]
@@ -177,7 +178,7 @@ def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
     return f"{len(shown)} of {len(names)} configurations, from the soonest to the latest; not drawn: {', '.join(left)}"
 
 
-def pick_best_to_worst(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, ...]:
+def pick_best_to_worst(rows: pd.DataFrame, names: Sequence[str], colours: Mapping[str, Rgb]) -> tuple[str, ...]:
     """Up to four configurations from best to worst, by the share of rows that pass, then by mean time to detection.
 
     An object that is never detected counts as the longest episode.
@@ -189,4 +190,4 @@ def pick_best_to_worst(rows: pd.DataFrame, names: Sequence[str]) -> tuple[str, .
         passes = rows["braking_pass"].astype(float).groupby(rows["configuration"]).mean()
     # Of equal ones the first ranks better: usually that is the truth.
     ranked = sorted(names, key=lambda name: (-passes[name], late_s[name], names.index(name)))
-    return pick_evenly(ranked, _COLUMNS)
+    return pick_evenly(ranked, _COLUMNS, colours=colours)

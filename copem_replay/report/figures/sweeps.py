@@ -14,7 +14,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.summary import describe_intervals
-from copem_replay.report.figures.selection import MOST_LINES, describe_left_out, pick_evenly
+from copem_replay.report.figures.selection import MOST_LINES, describe_left_out
 from copem_replay.report.figures.style import (
     Appearance,
     add_note,
@@ -26,6 +26,7 @@ from copem_replay.report.figures.style import (
     shorten_names,
 )
 from copem_replay.results.compare.labels import find_baseline
+from copem_replay.results.shown_objects import pick_evenly
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,7 +98,7 @@ def _find_differing(sweep: pd.DataFrame, names: Sequence[str], baseline: str) ->
     """
     mean_s = sweep["ttd_rmst_s"].groupby(sweep["configuration"]).mean() if "ttd_rmst_s" in sweep else pd.Series()
     others = sorted((name for name in names if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
-    picked = {baseline, *pick_evenly(others, MOST_LINES - 1)}
+    picked = pick_evenly(others, MOST_LINES, [baseline])
     return tuple(name for name in names if name in picked)
 
 
