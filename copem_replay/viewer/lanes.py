@@ -174,8 +174,8 @@ def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | N
         if text is None or text in ONSET_IS:
             values.append(text)
             continue
-        room = (wide - PADDING_POINTS) / LETTER_POINTS if wide > 0 else len(text)
-        label = next((words for words in _shorten_words(text) if len(words) <= room), _cut_name(text, int(room)))
+        room = len(text) if wide <= 0 else int(min((wide - PADDING_POINTS) / LETTER_POINTS, len(text)))
+        label = next((words for words in _shorten_words(text) if len(words) <= room), _cut_name(text, room))
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
         values.append(value)
