@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import InputError, OutputError
@@ -13,6 +15,7 @@ from copem_replay.results.read import Results
 
 if TYPE_CHECKING:
     from copem_replay.results.verdicts import Judgement
+    from copem_replay.viewer.open import Sought
 
 AnyResults: TypeAlias = Results | str | PathLike[str]
 """Results, of `run` or read from a folder, or the path of a results folder."""
@@ -136,12 +139,22 @@ def write_report(
     return write_html_report(_results_or_path(results), path, baseline=baseline, by=by)
 
 
-def view(results: AnyResults, *, web: bool = False, object_id: str | None = None, log: str | None = None) -> None:
+def view(
+    results: AnyResults,
+    *,
+    web: bool = False,
+    object_id: str | None = None,
+    log: str | None = None,
+    with_recording: str | PathLike[str] | None = None,
+) -> None:
     """Open the recordings of a results folder, or one `.rrd` file, in the Rerun viewer, and wait until it ends.
 
     Each opens just before the first onset.
 
     `object_id`: only recordings with this measured object, just before its onset; `log`: only those of this log.
+
+    `with_recording`: a recording of these results; the run that is shown of it is written anew, for as long as the
+    viewer is open, with images and points of the recording itself behind the boxes.
 
     `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
     interrupted (Ctrl-C).
@@ -167,6 +180,9 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
         raise InputError(
             f"{folder}: expected a results folder, found a recording; `copem-replay run {folder}` makes one"
         )
+    if with_recording is not None:
+        sought = None if object_id is None else Sought(object_id, log)
+        return _view_with_recording(folder, Path(with_recording), sought, web=web)
     files = list_rrd_files(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
@@ -183,6 +199,21 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
             raise InputError(f"{folder}: no recording{where} has the measured object {object_id!r}")
     check_recordings([folder / file.relative_to(folder.absolute()) for file in files])
     return _open_files(folder, files, instants_s, web=web)
+
+
+def _view_with_recording(folder: Path, recording: Path, sought: Sought | None, *, web: bool) -> None:
+    """Open the shown run of a recording with what else the recording holds."""
+    from copem_replay.results.read import open_results
+    from copem_replay.viewer import write_with_recording
+    from copem_replay.viewer.open import opening_s
+
+    with TemporaryDirectory(prefix="copem-replay-") as scratch:
+        file, notes = write_with_recording(Path(scratch), open_results(folder), recording)
+        sys.stderr.writelines(f"note: {line}\n" for line in notes)
+        instants_s = opening_s(Path(scratch), [file], sought, folder)
+        if sought is not None and not instants_s:
+            raise InputError(f"{folder}: {recording} has no measured object {sought.object_id!r}")
+        _open_files(Path(scratch), [file], instants_s, web=web)
 
 
 def _open_files(folder: Path, files: Sequence[Path], instants_s: Mapping[Path, float], *, web: bool) -> None:
