@@ -17,10 +17,9 @@ import numpy as np
 import pyarrow as pa
 
 from copem_replay.core.errors import RecordingError
-from copem_replay.core.interpolation import compose_rotations, interpolate_states, rotate_vectors
 from copem_replay.core.tracks import Int
 from copem_replay.io.containers.rosbag2 import list_bag_files
-from copem_replay.io.frames import FrameTree, SampledPoses, read_log_context
+from copem_replay.io.frames import FrameTree, PoseTrack, SampledPoses, read_log_context
 from copem_replay.io.open import DriveRecordings, fetch_place, open_log
 from copem_replay.io.recording import Recording
 from copem_replay.io.schemas.poses import is_pose
@@ -41,8 +40,6 @@ IMAGES = {
 POINTS = {"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"}
 CALIBRATIONS = {"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"}
 """Schemas that Rerun's reader draws (0.41)."""
-BODY_M = 5.0
-"""Farthest that the frame of a vehicle is from the middle of its box: at its rear axle, at its front."""
 _LOGGED = "message_log_time", "message_publish_time"
 _FRAME, _PLANE = "CoordinateFrame:frame", "Pinhole:child_frame"
 _TOLD = 6  # topics named in a note, at most
@@ -89,8 +86,7 @@ def find_recorded_sensors(recording: Recording) -> Iterator[RecordedSensors]:
             topic: frame.lstrip("/")
             for topic, frame in named.items()
             if topic in points or topic in pinholes
-            if (poses := place_sensor(recording, around.frames, frame.lstrip("/"), recording.truth.stamp_ns))
-            is not None
+            if (poses := _place(recording, around.frames, frame.lstrip("/"), recording.truth.stamp_ns)) is not None
             if poses.there.any()
         }
         others = [
@@ -146,42 +142,17 @@ def _read(
         raise RecordingError(f"Rerun's reader of MCAP cannot read it: {error}", path=path) from None
 
 
-def place_sensor(recording: Recording, tree: FrameTree, frame: str, stamp_ns: Int) -> SampledPoses | None:
-    """The pose of a sensor's frame in that of the truth at instants (K,); None: not known.
-
-    Where the truth names no frame it is the outermost one, if the ego is there where the truth has it; else what the
-    sensor is fixed in stands on the ground, below the middle of the ego's box.
-    """
-    if recording.world:
+def _place(recording: Recording, tree: FrameTree, frame: str, stamp_ns: Int) -> SampledPoses | None:
+    """The pose of a sensor's frame in that of the truth at instants (K,); None: not known."""
+    truth = recording.truth
+    rows = np.flatnonzero(truth.row_object_ix == recording.scene.ego_ix)
+    if recording.world or not len(rows):
         return tree.place(frame, recording.world, stamp_ns)
-    if recording.scene.ego_ix < 0:
-        return None
-    chain, outer, truth_ns = tree.chain(frame), tree.world_of(frame), recording.truth.stamp_ns
-    moving = [name for name in chain[:-1] if name not in tree.static and len(tree.pose_tracks[name].stamp_ns) > 1]
-    body = moving[0] if moving else chain[-1]
-    found = tree.place(body, outer, truth_ns) if moving else None
-    if found is not None:
-        own = _place_ego(recording, truth_ns, tree.max_gap_s)
-        apart_m = np.hypot(*(own.position_m - found.position_m)[own.there & found.there, :2].T)
-        if len(apart_m) and apart_m.max() <= BODY_M:
-            return tree.place(frame, outer, stamp_ns)
-    fixed, own = tree.place(frame, body, stamp_ns), _place_ego(recording, stamp_ns, tree.max_gap_s)
-    if fixed is None or body == frame:
-        return None
-    at_m = own.position_m + rotate_vectors(own.rotation, fixed.position_m)
-    return SampledPoses(own.there & fixed.there, at_m, compose_rotations(own.rotation, fixed.rotation))
-
-
-def _place_ego(recording: Recording, stamp_ns: Int, max_gap_s: float) -> SampledPoses:
-    """Where the ground below the middle of the ego's box is, as the truth has it."""
-    scene = recording.scene
-    states, there = interpolate_states(
-        recording.truth, np.full(len(stamp_ns), scene.ego_ix), (stamp_ns - scene.t0_ns) * np.float64(1e-9),
-        t0_ns=scene.t0_ns, max_gap_s=max_gap_s,
-    )  # fmt: skip
-    at_m = np.stack([states["x_m"], states["y_m"], states["z_m"] - states["height_m"] / 2], axis=1)
-    half_rad, zero = states["yaw_rad"] / 2, np.zeros(len(stamp_ns))
-    return SampledPoses(there, at_m, np.stack([zero, zero, np.sin(half_rad), np.cos(half_rad)], axis=1))
+    ground_m, half_rad = truth.z_m[0, rows] - truth.height_m[0, rows] / 2, truth.yaw_rad[0, rows] / 2
+    at_m, zero = np.stack([truth.x_m[0, rows], truth.y_m[0, rows], ground_m], axis=1), np.zeros(len(rows))
+    turned = np.stack([zero, zero, np.sin(half_rad), np.cos(half_rad)], axis=1)
+    course = PoseTrack("", truth.stamp_ns[truth.frame_ix[rows]], at_m, turned, np.zeros_like(at_m), tree.max_gap_s)
+    return tree.place_by_ego(frame, course, stamp_ns)
 
 
 def write_recorded(out: RecordingSink, sensors: RecordedSensors) -> list[str]:
@@ -199,7 +170,7 @@ def write_recorded(out: RecordingSink, sensors: RecordedSensors) -> list[str]:
             _send(out, topic, rows, stamp_ns - scene.t0_ns)
             seen.add(topic)
             if topic in sensors.frames and _FRAME in rows.schema.names:
-                poses = place_sensor(sensors.recording, sensors.tree, sensors.frames[topic], stamp_ns)
+                poses = _place(sensors.recording, sensors.tree, sensors.frames[topic], stamp_ns)
                 assert poses is not None
                 columns = rr.Transform3D.columns(
                     translation=poses.position_m[poses.there], quaternion=poses.rotation[poses.there]
@@ -226,13 +197,11 @@ def _send(out: RecordingSink, topic: str, rows: pa.RecordBatch, elapsed_ns: Int 
 
 
 def _find_stamps(rows: pa.RecordBatch, shift_ns: int, ahead_ns: int) -> Int:
-    """(K,) instants of rows on the clock of the truth: their stamps, where these are of that clock, else of logging."""
-    times = {n: rows.column(n).cast(pa.int64()).to_numpy() for n in rows.schema.names if ":" not in n}
-    found: Int = times[_LOGGED[0]] + shift_ns
-    for name, stamp_ns in times.items():
-        if name not in _LOGGED and abs(np.median(stamp_ns - ahead_ns - found)) <= SLACK_NS:
-            return np.asarray(stamp_ns - ahead_ns)
-    return found
+    """(K,) instants of rows on the clock of the truth: of stamps by this clock or that of logging, else of logging."""
+    times = {name: rows.column(name).cast(pa.int64()).to_numpy() for name in rows.schema.names if ":" not in name}
+    logged_ns: Int = times.pop(_LOGGED[0]) + shift_ns
+    own = [ns + by for name, ns in times.items() if name not in _LOGGED for by in (-ahead_ns, shift_ns)]
+    return next((ns for ns in own if abs(np.median(ns - logged_ns)) <= SLACK_NS), logged_ns)
 
 
 def _parts(topic: str) -> list[str]:
