@@ -111,7 +111,7 @@ def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought, place: P
 def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
     """Log and run of each recording, by its path in the folder without suffix."""
     shown = results.provenance.data["runs_shown"]
-    several = len(shown) > 1
+    several = len(results.provenance.logs) > 1
     return {
         (f"{shown_run['file']}/{portable_name(log)}" if several else shown_run["file"]): (log, int(shown_run["run"]))
         for log, runs in shown.items()

@@ -95,12 +95,10 @@ def find_recorded_sensors(recording: Recording) -> Iterator[RecordedSensors]:
             if c.messages and c.topic not in (*images, *points, *calibrations, recording.topic)
             if not (is_list(c) or is_pose(c) or c.schema.startswith("osi3."))
         ]
+        bare = [topic for topic in images + points if topic not in frames]
         notes = [
             _tell("Rerun's reader of MCAP does not draw", others),
-            _tell(
-                "no boxes on, for want of a calibration or of transforms",
-                [t for t in images + points if t not in frames],
-            ),
+            _tell("no boxes on, for want of a calibration or of transforms", bare),
             "" if images + points else "it has no images and no points that Rerun's reader of MCAP draws",
         ]
         yield RecordedSensors(
@@ -133,9 +131,8 @@ def _read(
         reader = McapReader(path, include_topic_regex=asked, start_time_ns=from_ns, end_time_ns=to_ns)
         for chunk in reader.stream() if asked else ():
             rows = chunk.to_record_batch()
-            drawn = [
-                f.name for f in rows.schema if (f.metadata or {}).get(b"rerun:archetype", b"").startswith(b"rerun.")
-            ]
+            archetypes = {f.name: (f.metadata or {}).get(b"rerun:archetype", b"") for f in rows.schema}
+            drawn = [name for name, of in archetypes.items() if of.startswith(b"rerun.")]
             if rows.num_rows and not chunk.is_static and drawn:
                 yield by_entity[chunk.entity_path.lstrip("/")], rows.select([*chunk.timeline_names, *drawn])
     except (RuntimeError, ValueError) as error:
@@ -172,15 +169,12 @@ def write_recorded(out: RecordingSink, sensors: RecordedSensors) -> list[str]:
             if topic in sensors.frames and _FRAME in rows.schema.names:
                 poses = _place(sensors.recording, sensors.tree, sensors.frames[topic], stamp_ns)
                 assert poses is not None
-                columns = rr.Transform3D.columns(
-                    translation=poses.position_m[poses.there], quaternion=poses.rotation[poses.there]
-                )
+                at_m, turned = poses.position_m[poses.there], poses.rotation[poses.there]
+                columns = rr.Transform3D.columns(translation=at_m, quaternion=turned)
                 out.columns([RECORDED, *_parts(topic)], stamp_ns[poses.there] - scene.t0_ns, columns)
             out.flush()
-    missed = _tell(
-        "Rerun's reader of MCAP finds no message, while the truth lasts, on", [t for t in topics if t not in seen]
-    )
-    return [*sensors.notes, *filter(None, [missed])]
+    missed = [topic for topic in topics if topic not in seen]
+    return [*sensors.notes, *filter(None, [_tell("Rerun's reader finds no message while the truth lasts on", missed)])]
 
 
 def _send(out: RecordingSink, topic: str, rows: pa.RecordBatch, elapsed_ns: Int | None) -> None:
@@ -205,7 +199,7 @@ def _find_stamps(rows: pa.RecordBatch, shift_ns: int, ahead_ns: int) -> Int:
 
 
 def _parts(topic: str) -> list[str]:
-    return topic.strip("/").split("/")
+    return [part for part in topic.split("/") if part]
 
 
 def _entity(*topics: str) -> str:

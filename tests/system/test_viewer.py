@@ -16,6 +16,7 @@ from copem_replay.core.errors import InputError
 from copem_replay.viewer import check_viewer, sink, write_rrd
 from copem_replay.viewer.open import read_identities, seek_recordings
 from tests.helpers.viewer import Viewer, free_port, headless_viewer
+from tests.viewer.test_recorded import replayed, sensors
 from tests.viewer.test_rrd import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
 
 ROOT = Path(__file__).parents[2]
@@ -75,6 +76,12 @@ def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
             assert (width >= 400, height >= 200) == (True, True)
     whole = viewer.picture()
     assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
+    assert viewer.errors() == []
+
+
+def test_images_and_points_of_the_recording(viewer: Viewer, tmp_path: Path) -> None:
+    viewer.open(replayed(tmp_path, sensors()) / "replay.rrd")
+    assert viewer.views() >= {"/cam/image · PEM", "Points · PEM"}
     assert viewer.errors() == []
 
 

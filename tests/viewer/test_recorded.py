@@ -8,6 +8,7 @@ All are stamped every 0.1 s and logged 30 to 50 ms later; transforms are logged 
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +178,13 @@ def test_what_rerun_cannot_draw_or_place_is_said(results: Path, tmp_path: Path) 
 def test_without_sensors_there_is_a_note_and_no_page(tmp_path: Path) -> None:
     bare = replayed(tmp_path, [])
     assert notes_of(bare) == ["drive: it has no images and no points that Rerun's reader of MCAP draws"]
+
+
+def test_names_of_topics_are_those_of_entities(tmp_path: Path) -> None:
+    names = {"/cam/image": "/cam 1/im-age.2", "/points": "//plain//points"}
+    place = replayed(tmp_path, [replace(one, name=names.get(one.name, one.name)) for one in sensors()])
+    for entity in (r"/recorded/cam\ 1/im-age.2", "/recorded/plain/points"):
+        assert len(poses(place, entity)) == FRAMES
 
 
 def test_a_truth_of_another_clock(tmp_path: Path) -> None:
