@@ -1,4 +1,4 @@
-# make demo | quick | test | test-long | test-random | bench | check | notebooks | pictures | site | release: each sets up .venv on
+# make demo | quick | test | test-long | test-random | bench | check | notebooks | pictures | reruns | site | release: each sets up .venv on
 # its first call and never again while pyproject and requirements stay.
 # Another Python beside it: make test PYTHON=python3.13 VENV=.venv-3.13
 PYTHON ?= python3
@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Modules are kept compiled, wherever this runs: else every command compiles two hundred of them anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo quick test test-long test-random kernels bench check notebooks pictures site release requirements clean
+.PHONY: demo quick test test-long test-random kernels bench check notebooks pictures reruns site release requirements clean
 
 # Packages come by hash, through uv where it is there: what runs need, and for all but `demo` the rest. As with uv, modules
 # are compiled when they are first imported: most never are, and compiling all takes two fifths of the time.
@@ -63,8 +63,19 @@ check: $(VENV)/.rest
 notebooks: $(VENV)/.rest
 	$(BIN)/python tools/run_notebooks.py
 
+# Every night: the pictures of README and docs, by the commands beside them.
 pictures: $(VENV)/.rest
 	$(BIN)/python tools/pictures.py
+
+# Viewers of the minor versions before and after the pinned one, as far as there are any: tests/system/test_viewer.py asks
+# them to read what this one writes.
+RERUN_MINOR := $(shell sed -n 's/^rerun-sdk==0\.\([0-9]*\)\..*/\1/p' requirements.txt)
+reruns:
+	for minor in $$(($(RERUN_MINOR) - 1)) $$(($(RERUN_MINOR) + 1)); do \
+	  $(PYTHON) -m venv .venv-rerun-0.$$minor; \
+	  .venv-rerun-0.$$minor/bin/python -m pip install --quiet --disable-pip-version-check "rerun-sdk==0.$$minor.*" \
+	    || { rm -r .venv-rerun-0.$$minor; echo "no rerun-sdk 0.$$minor"; }; \
+	done
 
 # out/site, from docs/ by mkdocs.yml; a link or an anchor that leads nowhere stops it.
 site: $(VENV)/.rest

@@ -37,8 +37,6 @@ QUESTIONS = {
     "Units": "where_units_are.png",
 }
 """By pages of the viewer's layout: what is taken of the city, with 80 road users, at 1280 × 720."""
-AT_S = 3.6
-"""Of the recording: 0.6 s after the pedestrian's first step (chosen: some know of him, others not yet)."""
 PATIENCE_S = 180.0
 SETTLED = 3
 """So many pictures in a row have to be the same: what is loaded is drawn piece by piece (chosen)."""
@@ -52,18 +50,16 @@ def main() -> None:
     out = parser.parse_args().out
     os.environ["RERUN_ANALYTICS"] = "0"
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / "tc016d"
-        _replay(folder)
-        differences = Path(scratch) / "differences.rrd"
+        folder = _run("tc016d", Path(scratch))
+        differences = folder / "differences.rrd"
         _differences(folder, differences)
         made = {
-            "replay.png": _seen(folder / "replay.rrd", AT_S)["Overview"],
-            "crossing.png": _crossing(Path(scratch) / "crossing"),
-            "differences.png": _seen(differences, AT_S)["Overview"],
+            "replay.png": _seen(folder / "replay.rrd")["Overview"],
+            "crossing.png": _seen(_run("crossing_memory", Path(scratch)) / "replay.rrd")["Overview"],
+            "differences.png": _seen(differences)["Overview"],
             "runs.png": _drawn(folder),
         }
-        city = Path(scratch) / "city"
-        seen = _seen(city / "replay.rrd", _city(city), list(QUESTIONS))
+        seen = _seen(_city(Path(scratch) / "city") / "replay.rrd", list(QUESTIONS))
         made |= {QUESTIONS[page]: picture for page, picture in seen.items()}
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in made.items():
@@ -72,33 +68,19 @@ def main() -> None:
         print(f"{name}: {picture.width} × {picture.height}, {len(content) / 1000:.0f} kB")
 
 
-def _replay(folder: Path) -> None:
-    """`copem-replay run logs/tc016d.yaml`, with the median run shown."""
+def _run(name: str, scratch: Path) -> Path:
+    """The results of `copem-replay run logs/NAME.yaml`, the command beside the picture: its runs, the one it shows."""
     import copem_replay as cr
 
-    experiment = cr.load_experiment(ROOT / "logs/tc016d.yaml")
-    cr.run(experiment.model_copy(update={"show": experiment.show.model_copy(update={"run": "median"})})).save(folder)
+    return cr.run(ROOT / f"logs/{name}.yaml").save(scratch / name)
 
 
-def _crossing(folder: Path) -> Picture:
-    """The overview of `copem-replay run logs/crossing_memory.yaml`, at the instant at which its recording opens."""
-    import copem_replay as cr
-    from copem_replay.viewer.open import opening_s
-
-    experiment = cr.load_experiment(ROOT / "logs/crossing_memory.yaml")
-    cr.run(experiment.model_copy(update={"show": experiment.show.model_copy(update={"run": 0})})).save(folder)
-    recording = folder / "replay.rrd"
-    return _seen(recording, opening_s(folder, [recording])[recording])["Overview"]
-
-
-def _city(folder: Path) -> float:
-    """The city's results; the instant at which they open."""
+def _city(folder: Path) -> Path:
+    """The city's results."""
     import copem_replay as cr
     from city_traffic import experiment, write
-    from copem_replay.viewer.open import opening_s
 
-    cr.run(experiment(write(folder.parent))).save(folder)
-    return opening_s(folder, [folder / "replay.rrd"])[folder / "replay.rrd"]
+    return cr.run(experiment(write(folder.parent))).save(folder)
 
 
 def _differences(folder: Path, out: Path) -> None:
@@ -119,9 +101,11 @@ def _drawn(folder: Path) -> Picture:
     return Image.open(content)
 
 
-def _seen(recording: Path, at_s: float, pages: Sequence[str] = ("Overview",)) -> dict[str, Picture]:
-    """The whole viewer with a recording open, on each of some pages, when all of it is drawn."""
-    found = {}
+def _seen(recording: Path, pages: Sequence[str] = ("Overview",)) -> dict[str, Picture]:
+    """The whole viewer as `copem-replay view` opens a recording, on each of some pages, when all of it is drawn."""
+    from copem_replay.viewer.open import opening_s
+
+    found, at_s = {}, opening_s(recording.parent, [recording])[recording]
     with _viewer() as viewer:
         viewer.open(str(recording))
         _until(lambda: viewer.get_state().views and not viewer.get_state().loading)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from copem_replay.core.errors import InputError, OutputError
 from copem_replay.results.compare import Comparison
-from copem_replay.results.read import Results
+from copem_replay.results.read import Results, open_results
 
 if TYPE_CHECKING:
     from copem_replay.results.verdicts import Judgement
+    from copem_replay.viewer.open import Sought
 
 AnyResults: TypeAlias = Results | str | PathLike[str]
 """Results, of `run` or read from a folder, or the path of a results folder."""
@@ -97,7 +100,6 @@ def judge(
     """
     from copem_replay.experiment.cross_references import read_criteria
     from copem_replay.results.judge import judge_results
-    from copem_replay.results.read import open_results
 
     judged, other = (
         given if isinstance(given, Results | None) else open_results(Path(given), "summary.csv", "tally.parquet")
@@ -136,12 +138,22 @@ def write_report(
     return write_html_report(_results_or_path(results), path, baseline=baseline, by=by)
 
 
-def view(results: AnyResults, *, web: bool = False, object_id: str | None = None, log: str | None = None) -> None:
+def view(
+    results: AnyResults,
+    *,
+    web: bool = False,
+    object_id: str | None = None,
+    log: str | None = None,
+    with_recording: str | PathLike[str] | None = None,
+) -> None:
     """Open the recordings of a results folder, or one `.rrd` file, in the Rerun viewer, and wait until it ends.
 
     Each opens just before the first onset.
 
     `object_id`: only recordings with this measured object, just before its onset; `log`: only those of this log.
+
+    `with_recording`: a recording of these results; the run that is shown of it is written anew, for as long as the
+    viewer is open, with images and points of the recording itself behind the boxes.
 
     `web`: serve viewer and recordings on a free port of 127.0.0.1 instead, print the address, and go on until
     interrupted (Ctrl-C).
@@ -155,42 +167,47 @@ def view(results: AnyResults, *, web: bool = False, object_id: str | None = None
     """
     from copem_replay.experiment.file import is_recording
     from copem_replay.results.provenance import check_format
-    from copem_replay.results.seals import check_recordings
-    from copem_replay.viewer.open import Sought, list_rrd_files, opening_s
+    from copem_replay.viewer import write_with_recording
+    from copem_replay.viewer.open import Sought, list_rrd_files
 
     folder = results.require_folder() if isinstance(results, Results) else Path(results)
-    if folder.is_file() and folder.suffix == ".rrd" and object_id is None and log is None:
-        check_recordings([folder])
-        files, folder = [folder.absolute()], folder.absolute().parent
-        return _open_files(folder, files, opening_s(folder, files), web=web)
+    if log is not None and object_id is None:
+        raise InputError("--log: expected --object ID with it, found none")
+    sought = None if object_id is None else Sought(object_id, log)
+    if folder.is_file() and folder.suffix == ".rrd" and sought is None and with_recording is None:
+        return _open_sought(folder.absolute().parent, folder.absolute().parent, [folder.absolute()], sought, web=web)
     if is_recording(folder):
         raise InputError(
             f"{folder}: expected a results folder, found a recording; `copem-replay run {folder}` makes one"
         )
-    files = list_rrd_files(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     check_format(folder)
-    if not files:
+    if with_recording is not None:
+        with TemporaryDirectory(prefix="copem-replay-") as scratch:
+            file, notes = write_with_recording(Path(scratch), open_results(folder), Path(with_recording))
+            sys.stderr.writelines(f"note: {line}\n" for line in notes)
+            return _open_sought(folder, Path(scratch), [file], sought, web=web)
+    if not (files := list_rrd_files(folder)):
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
-    if log is not None and object_id is None:
-        raise InputError("--log: expected --object ID with it, found none")
-    instants_s = opening_s(folder, files, None if object_id is None else Sought(object_id, log))
-    if object_id is not None:
-        files = [file for file in files if file in instants_s]
-        if not files:
-            where = "" if log is None else f" of log {log}"
-            raise InputError(f"{folder}: no recording{where} has the measured object {object_id!r}")
-    check_recordings([folder / file.relative_to(folder.absolute()) for file in files])
-    return _open_files(folder, files, instants_s, web=web)
+    return _open_sought(folder, folder, files, sought, web=web)
 
 
-def _open_files(folder: Path, files: Sequence[Path], instants_s: Mapping[Path, float], *, web: bool) -> None:
-    """Open recordings at their instants, here or in a browser. Raises OutputError where the viewer does not open."""
-    from copem_replay.viewer.open import open_viewer
+def _open_sought(folder: Path, place: Path, files: Sequence[Path], sought: Sought | None, *, web: bool) -> None:
+    """Open recordings of results, which lie at a place, here or in a browser: those of the object sought.
 
+    Raises OutputError where the viewer does not open.
+    """
+    from copem_replay.results.seals import check_recordings
+    from copem_replay.viewer.open import open_viewer, opening_s
+
+    instants_s = opening_s(place, files, sought, folder)
+    if sought is not None and not (files := [file for file in files if file in instants_s]):
+        where = "" if sought.log is None else f" of log {sought.log}"
+        raise InputError(f"{folder}: no recording{where} has the measured object {sought.object_id!r}")
+    check_recordings([place / file.relative_to(place.absolute()) for file in files])
     if web:
-        _serve_recordings(folder, files, instants_s)
+        _serve_recordings(place, files, instants_s)
     elif code := open_viewer(files, instants_s):
         raise OutputError(
             f"{folder}: the Rerun viewer could not be opened (it ended with {code}); without a display, "

@@ -11,7 +11,7 @@ from typer.models import ArgumentInfo, OptionInfo
 
 from copem_replay.core.errors import OutputError
 
-INPUTS: Final = ("log", "maps", "criteria", "before", "types")
+INPUTS: Final = ("log", "maps", "criteria", "before", "types", "with_recording")
 """Options that name files or folders to read: all others that name one are outputs."""
 _PATHS: Final = ("FILE", "FOLDER", "DIR")
 

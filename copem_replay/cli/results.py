@@ -301,6 +301,9 @@ def view(
         str | None, typer.Option(metavar="ID", help="Open at the onset of this object [at the first onset].")
     ] = None,
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Log of that object [any].")] = None,
+    with_recording: Annotated[
+        Path | None, typer.Option("--with", metavar="FILE", help="Add the images and points of this recording.")
+    ] = None,
 ) -> int:
     """Open the recordings of a results folder in the viewer.
 
@@ -308,5 +311,5 @@ def view(
     """
     from copem_replay.api.results import view as view_results
 
-    view_results(folder, web=web, object_id=object, log=log)
+    view_results(folder, web=web, object_id=object, log=log, with_recording=with_recording)
     return 0

@@ -117,7 +117,7 @@ class Show(Frozen):
     `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves
     the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `map: true` adds a
     view on a map of the world to the .rrd, for which the viewer asks a foreign host for tiles: it learns where the
-    drive was.
+    drive was. `with_recording: true` adds images and points of the recording, as large as they are.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
@@ -125,6 +125,7 @@ class Show(Frozen):
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
     truth: bool = True
     map: Annotated[bool, Field(exclude_if=operator.not_)] = False
+    with_recording: Annotated[bool, Field(exclude_if=operator.not_)] = False
 
     def asked(self) -> tuple[WhichRun, ...]:
         """The runs in their order: several, one or none."""

@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from copem_replay.io.config import EgoTopic
 
 
+BODY_M = 5.0
+"""Farthest that the frame of a vehicle is from the middle of its box: at its rear axle, at its front."""
+
+
 @dataclass(frozen=True)
 class SampledPoses:
     """Poses at K instants: `there (K,)` whether there is one, `position_m (K, 3)`, `rotation (K, 4)` as x, y, z, w."""
@@ -146,6 +150,21 @@ class FrameTree:
             rotate_vectors(turn, own.position_m - other.position_m),
             compose_rotations(turn, own.rotation),
         )
+
+    def place_by_ego(self, frame: str, ego: PoseTrack, stamp_ns: Int) -> SampledPoses | None:
+        """The pose of `frame` in the frame of the course of an ego, which is none of the tree's; None: not known.
+
+        It is the outermost one, if the ego is there by both; else what `frame` is fixed in goes with the ego.
+        """
+        chain, outer = self.chain(frame), self.world_of(frame)
+        body = next((name for name in chain[:-1] if not self._stands(name)), chain[-1])
+        found = self.place(body, outer, ego.stamp_ns) if body in self.pose_tracks else None
+        if found is not None and found.there.any():
+            apart_m = np.hypot(*(found.position_m - ego.position_m)[found.there, :2].T)
+            if apart_m.max() <= BODY_M:
+                return self.place(frame, outer, stamp_ns)
+        carried = FrameTree(self.pose_tracks | {body: ego}, self.static - {body}, self.max_gap_s)
+        return None if body == frame else carried.place(frame, ego.parent, stamp_ns)
 
     def _climb(self, steps: Iterable[str], stamp_ns: Int) -> SampledPoses:
         """The pose of the first frame of `steps` in the parent of the last one."""

@@ -23,6 +23,7 @@
 | `plots/position_error/<object>/<configuration>` | fused to true position: running quartiles |
 | `plots/gospa/<configuration>`, `plots/known/<configuration>` | of all measured objects: GOSPA, number known |
 | `…/difference/…`, `plots/error_difference` | differences to a baseline (`viewer/curves.py`) |
+| `recorded/<topic>`, `pose/<frame>` | images and points of the recording itself (`viewer/recorded.py`) |
 | `legend/…` | the colour of each configuration |
 | `events/onsets`, `events/<configuration>`, `…/lists`, `…/needless`, `…/false` | texts: what happens when |
 | `difference`, `summary`, `words`, `false` | texts; `false`: the longest false tracks |
@@ -37,7 +38,7 @@ slices of time, so that little is held in memory.
 
 from __future__ import annotations
 
-from copem_replay.viewer.rrd import write_rrd
+from copem_replay.viewer.rrd import write_rrd, write_with_recording
 from copem_replay.viewer.sink import VIEWER, check_viewer
 
-__all__ = ["VIEWER", "check_viewer", "write_rrd"]
+__all__ = ["VIEWER", "check_viewer", "write_rrd", "write_with_recording"]

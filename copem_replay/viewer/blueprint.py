@@ -20,6 +20,7 @@ from copem_replay.viewer.camera import Camera, MovingPicture, follow_episodes
 from copem_replay.viewer.lanes import UnitLists, lanes_axis_s, select_list_lanes
 from copem_replay.viewer.legend import legend_view
 from copem_replay.viewer.map_view import asks_for_map, map_page
+from copem_replay.viewer.recorded import RecordedSensors, recorded_page
 from copem_replay.viewer.sink import (
     DIFFERENCE_SHORT,
     DIFFERENCE_TEXT,
@@ -73,7 +74,8 @@ class RecordingContent:
     the units, of which `named` have names. `lists`: lists that units send by a link, by configuration. `too_short`: ids
     of objects too short to judge. `opens_s`: the instant at which the recording opens. `counted`: rows of the table
     that count, of all passes; `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that
-    are known too briefly for words in a lane. `of_one`: all configurations are of one experiment.
+    are known too briefly for words in a lane. `of_one`: all configurations are of one experiment. `recorded`: what
+    sensors recorded, if shown.
     """
 
     replay: Replay
@@ -96,6 +98,7 @@ class RecordingContent:
     false_tracks: pd.DataFrame | None = None
     brief: Collection[int] = ()
     of_one: bool = True
+    recorded: RecordedSensors | None = None
 
     def id_of(self, object_ix: int) -> str:
         """Id of an object as drawn, with its class."""
@@ -522,6 +525,8 @@ def build_blueprint(content: RecordingContent) -> rrb.Blueprint:
     if any(content.received(name) for name in content.configurations):
         pages.append(units_page(content))
     pages += [map_page()] if content.with_map else []
+    if content.recorded is not None and content.recorded.images + content.recorded.points:
+        pages.append(recorded_page(content.recorded, content.eye, choose_overview(content)[0]))
     pages.append(text_page())
     # A blueprint cannot set the time cursor, but playing begins with the selection: at the first onset.
     panel = rrb.TimePanel(
@@ -562,6 +567,7 @@ def digest_layout(content: RecordingContent) -> str:
         [content.title(name) for name in content.configurations],
         *([under] if any(under := [content.under(k) for k in content.objects]) else []),
         *(["map"] if content.with_map else []),
+        *([content.recorded.images, content.recorded.points] if content.recorded is not None else []),
     )
     return digest_texts(repr(parts))
 

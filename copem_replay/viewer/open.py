@@ -59,13 +59,15 @@ class Sought:
     log: str | None = None
 
 
-def opening_s(folder: Path, files: Sequence[Path], sought: Sought | None = None) -> dict[Path, float]:
+def opening_s(
+    folder: Path, files: Sequence[Path], sought: Sought | None = None, results: Path | None = None
+) -> dict[Path, float]:
     """The instant at which each recording opens, in seconds since its log starts, as it says itself.
 
     With an object `sought` just before its onset, where the results say that the recording has it. A recording without
-    an instant is left out: it opens at its beginning.
+    an instant is left out: it opens at its beginning. `results`: where results are if not in the folder of the files.
     """
-    return _read_opening_s(files) if sought is None else _find_onsets_s(folder, files, sought)
+    return _read_opening_s(files) if sought is None else _find_onsets_s(folder, files, sought, results or folder)
 
 
 def _read_opening_s(files: Sequence[Path]) -> dict[Path, float]:
@@ -85,11 +87,11 @@ def _read_opening_s(files: Sequence[Path]) -> dict[Path, float]:
     return instants_s
 
 
-def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought) -> dict[Path, float]:
+def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought, place: Path) -> dict[Path, float]:
     """The instant just before the onset of the object sought, by recording that has it."""
     instants_s = {}
     try:
-        results = open_results(folder)
+        results = open_results(place)
         runs = _map_runs(results)
         for path in files:
             stem = _FURTHER_FILE.sub("", path.relative_to(folder.absolute()).with_suffix("").as_posix())
@@ -109,7 +111,7 @@ def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought) -> dict[
 def _map_runs(results: Results) -> dict[str, tuple[str, int]]:
     """Log and run of each recording, by its path in the folder without suffix."""
     shown = results.provenance.data["runs_shown"]
-    several = len(shown) > 1
+    several = len(results.provenance.logs) > 1
     return {
         (f"{shown_run['file']}/{portable_name(log)}" if several else shown_run["file"]): (log, int(shown_run["run"]))
         for log, runs in shown.items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -16,17 +16,24 @@ import numpy as np
 import pandas as pd
 
 from copem_replay.core.colours import Rgb, configuration_colours
+from copem_replay.core.errors import MOST_LISTED, InputError
+from copem_replay.core.files import portable_name
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import TRUTH, Bool, Float, Int, Tracks, splice_rows
-from copem_replay.experiment.schema import Experiment
+from copem_replay.experiment.drive import resolve_for_log
+from copem_replay.experiment.schema import Experiment, Show
+from copem_replay.io.open import list_recordings, sha256_of
+from copem_replay.metrics.columns import FALSE_TRACKS, NEEDLESS
 from copem_replay.metrics.detections_table import first_episodes
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
-from copem_replay.pipeline.one_run import share_curves
+from copem_replay.pipeline.one_run import STEM, ShownRun, share_curves
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import Sight, compute_sight, find_looked_at
 from copem_replay.pipeline.status import EpisodeClocks, compute_status, read_episode_clocks
+from copem_replay.results.again import replay_again
+from copem_replay.results.read import Results
 from copem_replay.results.shown_objects import ShownObjects, axis_s, choose_shown_objects, find_opening_s
 from copem_replay.results.write import Exporter, RunToExport
 from copem_replay.viewer import boxes, curves, lanes, sensors
@@ -64,6 +71,7 @@ from copem_replay.viewer.events import (
 from copem_replay.viewer.lanes import UnitLists, find_linked_lists, write_list_fates, write_list_lanes
 from copem_replay.viewer.legend import write_legend_bars
 from copem_replay.viewer.map_view import NO_PLACE, asks_for_map, write_map
+from copem_replay.viewer.recorded import RecordedSensors, find_recorded_sensors, write_recorded
 from copem_replay.viewer.sensors import FaultsShown, choose_named_units
 from copem_replay.viewer.sink import (
     NEAR_WORDS,
@@ -97,6 +105,7 @@ def write_rrd(
     needless: pd.DataFrame | None = None,
     false_tracks: pd.DataFrame | None = None,
     viewer: str | None = None,
+    recorded: RecordedSensors | None = None,
 ) -> list[str]:
     """Write one run of one log to a file and, with an address, to a viewer. Returns notes. Raises OutputError.
 
@@ -109,7 +118,8 @@ def write_rrd(
     logs and runs. `run_is`: why this run is shown, part of the recording's name. `baselines`: what configurations are
     held against, so that differences are marked. `colours`: by configuration; None: as in all files of the experiment.
     `of_one`: all configurations are of one experiment, so that nothing but their keys differs. `needless`,
-    `false_tracks`: rows of these tables of this log and run; None: not asked for.
+    `false_tracks`: rows of these tables of this log and run; None: not asked for. `recorded`: what sensors recorded,
+    which is in the first file.
     """
     counted, table = select_counted(table, experiment.measure.began), first_episodes(table)
     later_chunks = iter(run_tracks)
@@ -122,11 +132,11 @@ def write_rrd(
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
     with ExitStack() as stack:
-        files = []
+        files = list[_RecordingFile]()
         for part in parts:
             content = replace(
                 _build_content(replay, experiment, table, part.configurations, shown, first, baselines),
-                of_one=of_one, counted=counted, false_tracks=false_tracks,
+                of_one=of_one, counted=counted, false_tracks=false_tracks, recorded=None if files else recorded,
             )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.
@@ -145,10 +155,11 @@ def write_rrd(
             _write_brakes_and_false_tracks(file, replay, needless, false_tracks)
         del first  # so that only one chunk is held at a time
         _write_chunks(files, chunks, replay, experiment, collector)
+        of_sensors = write_recorded(files[0].out, recorded) if recorded is not None else []
         for file in files:
             _send_layout(file)
     notes = [NO_PLACE] if asks_for_map(experiment) and replay.scene.frame is None else []
-    return [*notes, *_list_notes(path, parts, [file.out.live for file in files])]
+    return [*notes, *of_sensors, *_list_notes(path, parts, [file.out.live for file in files])]
 
 
 @dataclass(frozen=True)
@@ -400,21 +411,54 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
     def write(path: Path, run: RunToExport) -> list[str]:
         shown = run.replayed.experiment.configurations
         configurations = {name: shown.get(name, configuration) for name, configuration in run.every.items()}
-        return write_rrd(
-            path,
-            run.replayed.replay,
-            run.replayed.experiment.model_copy(update={"configurations": configurations}),
-            run.replayed.run_tracks,
-            run.table,
-            run.summary,
-            run.shown.run,
-            run_is=run.shown.why,
-            needless=run.needless,
-            false_tracks=run.false_tracks,
-            viewer=viewer,
-        )
+        show = run.replayed.experiment.show
+        asked = show is not None and show.with_recording
+        with find_recorded_sensors(run.recording) if asked else nullcontext() as recorded:
+            return write_rrd(
+                path,
+                run.replayed.replay,
+                run.replayed.experiment.model_copy(update={"configurations": configurations}),
+                run.replayed.run_tracks,
+                run.table,
+                run.summary,
+                run.shown.run,
+                run_is=run.shown.why,
+                needless=run.needless,
+                false_tracks=run.false_tracks,
+                viewer=viewer,
+                recorded=recorded,
+            )
 
     return Exporter(".rrd", write, _list_file_names)
+
+
+def write_with_recording(scratch: Path, results: Results, file: Path) -> tuple[Path, list[str]]:
+    """Write the run that results show of a recording again, with its images and points, into a scratch folder.
+
+    Returns the path, there as in the folder of results, and notes. Raises InputError where it is none of these results.
+    """
+    digest, every = sha256_of(file), results.provenance.logs
+    logs = [log.name for log in every if log.sha256 == digest or file in list_recordings(results.log_place(log.name))]
+    if not logs:
+        known = ", ".join(f"{log.name} (SHA-256 {log.sha256[:12]}…)" for log in every[:MOST_LISTED])
+        raise InputError(f"{file}: expected a recording of {results.place}: {known}; found SHA-256 {digest[:12]}…")
+    log, experiment = logs[0], resolve_for_log(results.experiment, logs[0])
+    (first, *_) = results.provenance.data["runs_shown"].get(log) or [{"run": 0}]
+    run, shown = int(first["run"]), experiment.shown()
+    replayed, table = replay_again(results, log, run, shown)
+    show = (experiment.show or Show()).model_copy(update={"with_recording": True})
+    replayed = replace(replayed, experiment=replayed.experiment.model_copy(update={"show": show}))
+    events = []
+    for name in (NEEDLESS, FALSE_TRACKS):
+        rows = results.frame(name) if results.has(name) else None
+        events.append(None if rows is None else rows[(rows["log"] == log) & (rows["run"] == run)])
+    shown_run = ShownRun(run, first.get("run_is") or "", STEM)
+    summary, recording = results.summary, results.recording(log, results.experiment)
+    summary = summary[summary["configuration"].isin(list(shown))]
+    exported = RunToExport(recording, shown_run, replayed, experiment.configurations, table, summary, {}, *events)
+    path = scratch / (f"{STEM}.rrd" if len(every) == 1 else f"{STEM}/{portable_name(log)}.rrd")
+    path.parent.mkdir(exist_ok=True)
+    return path, make_rrd_exporter(None).write(path, exported)
 
 
 def _list_file_names(stem: str, configurations: int) -> list[str]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -36,6 +37,7 @@ from copem_replay.report.figures.style import (
     lay_out,
     render_figure,
 )
+from copem_replay.report.figures.sweeps import sweeps_figure
 from copem_replay.report.html.markup import INK, PAPER, line_swatch, page_colours, replace_colours, replace_greys
 from copem_replay.report.html.page import build_page as report_page
 from copem_replay.report.html.study import load_study
@@ -50,6 +52,7 @@ from copem_replay.report.html.tables import (
 from copem_replay.results.compare import compare_folders
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.shown_objects import choose_shown_objects, measure_apart
+from tests.helpers.compare_folders import unseal
 from tests.helpers.report_pages import ALONE, ONE, changed, eighteen, named, replayed, with_rows
 
 
@@ -203,6 +206,25 @@ class TestEighteen:
             f"{len(shown)} of 19 configurations, from the soonest to the latest; not drawn: {', '.join(left)}."
             in note(figure)
         )
+
+    def test_in_a_sweep_each_has_panels_of_its_own(self, many: Results, tmp_path: Path) -> None:
+        every = list(many.experiment.configurations)
+        rows = [("latency_s", at_s, name, at_s / 4, k + at_s, 10.0) for k, name in enumerate(every) for at_s in (0, 1)]
+        columns = ["sweep", "value", "configuration", "detected_share", "ttd_rmst_s", "list_rate_hz"]
+        assert many.folder is not None
+        place = unseal(Path(shutil.copytree(many.folder, tmp_path / "results")))
+        pd.DataFrame(rows, columns=columns).to_csv(place / "sweep.csv", index=False)
+        figure = sweeps_figure(read_results(place))
+        panels = np.array(figure.axes).reshape(11, 2)
+        quantities = ["Share detected", "Time to detection (s)\nmean, 5 % to 95 %"]
+        assert [axes.get_title(loc="left") for axes in panels[0]] == quantities
+        for axes, axes_s in panels:
+            name = axes.get_ylabel()
+            drawn = {str(line.get_label()): list(line.get_ydata()) for line in axes_s.get_lines()}
+            assert drawn == {one: [every.index(one), every.index(one) + 1] for one in ("c00", name)}
+            assert {line.get_label() for line in axes.get_lines()} == {"c00", name}
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == ["c00 (latency swept)"]
+        assert "12 of 19 configurations, from the soonest to the latest; not drawn: " in note(figure)
 
     def test_each_has_a_row(self, many: Results) -> None:
         every = set(many.experiment.configurations)

@@ -24,7 +24,7 @@ FLOORS = (
 )
 MOST_LINES = {
     "core": 5_300, "io": 11_800, "perception": 3_750, "communication": 1_200, "fusion": 4_200, "metrics": 10_200,
-    "experiment": 4_890, "pipeline": 6_560, "results": 7_400, "viewer": 5_120, "report": 5_250, "api": 1_200,
+    "experiment": 4_890, "pipeline": 6_560, "results": 7_400, "viewer": 5_400, "report": 5_260, "api": 1_200,
     "cli": 1_400, "extras": 14_920,
 }  # fmt: skip
 """Of a wing. A change that needs more takes something away, or a decision raises the row."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +16,10 @@ from copem_replay.core.errors import InputError
 from copem_replay.viewer import check_viewer, sink, write_rrd
 from copem_replay.viewer.open import read_identities, seek_recordings
 from tests.helpers.viewer import Viewer, free_port, headless_viewer
+from tests.viewer.test_recorded import replayed, sensors
 from tests.viewer.test_rrd import CHANGES, SUMMARY, Made, approaching, make, rerun, rows
 
+ROOT = Path(__file__).parents[2]
 VIEWS = {
     "PEM · whole run: 1 of 2 known",
     "pole · whole run: 2 of 2 known",
@@ -74,6 +79,12 @@ def test_the_file_as_an_engineer_sees_it(made: Made, viewer: Viewer) -> None:
     assert viewer.errors() == []
 
 
+def test_images_and_points_of_the_recording(viewer: Viewer, tmp_path: Path) -> None:
+    viewer.open(replayed(tmp_path, sensors()) / "replay.rrd")
+    assert viewer.views() >= {"/cam/image · PEM", "Points · PEM"}
+    assert viewer.errors() == []
+
+
 def test_sent_to_a_viewer_that_runs(made: Made, viewer: Viewer, tmp_path: Path) -> None:
     check_viewer(viewer.url)
     fewer = {name: made.run_tracks[name] for name in ("GT", "PEM")}
@@ -96,6 +107,24 @@ def test_a_viewer_that_goes_leaves_the_file_complete(
     said = write_rrd(path, made.replay, made.given, [made.run_tracks], made.table, SUMMARY, 3, viewer=url)
     assert said == [f"x.rrd: the viewer at {url} went before it had everything; the file is complete"]
     assert rerun("rrd", "compare", "--unordered", path, made.path).returncode == 0
+
+
+@pytest.mark.parametrize("step", [-1, 1], ids=["before", "after"])
+def test_another_minor_version_of_rerun_reads_the_same(made: Made, step: int) -> None:
+    """Every value, as its own program prints them. `make reruns` gets these versions."""
+    major, minor, _ = version("rerun-sdk").split(".")
+    name = f"{major}.{int(minor) + step}"
+    program = ROOT / f".venv-rerun-{name}/bin/rerun"
+    if not program.is_file():
+        pytest.skip(f"no rerun-sdk {name} here: make reruns, if there is such a version")
+    printed = []
+    for one in (program, Path(sys.executable).with_name("rerun")):
+        assert subprocess.run([one, "rrd", "verify", made.path], check=False, timeout=120).returncode == 0
+        command = [one, "rrd", "print", "-vvv", made.path]
+        told = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+        printed.append([line for line in told.splitlines() if "* version:" not in line])
+    assert printed[0] == printed[1]
+    assert sum("Boxes3D:centers" in line for line in printed[0]) > 1
 
 
 def test_where_no_viewer_is_or_can_be() -> None:

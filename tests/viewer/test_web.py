@@ -88,6 +88,16 @@ class TestOpening:
             "replay/drive.rrd",
         ]
         assert opening_s(folder, files).keys() == set(files)
+        assert opening_s(folder, files, Sought("2", "again")).keys() == {files[0]}
+
+    def test_of_several_logs_one_is_shown(self, tmp_path: Path) -> None:
+        drive(tmp_path / "drive.mcap")
+        drive(tmp_path / "again.mcap")
+        (tmp_path / "e.yaml").write_text(changed("logs: [drive.mcap, again.mcap]", "show: {run: 0}"))
+        folder = cr.run(tmp_path / "e.yaml").save(tmp_path / "r")
+        (file,) = list_rrd_files(folder)
+        assert file == folder.absolute() / "replay/drive.rrd"
+        assert opening_s(folder, [file], Sought("2")) == {file: pytest.approx(0.5)}
 
     def test_at_an_object(self, results: Path) -> None:
         """Its onset is at 1 s, as that of all others; of an object that is nowhere there is no instant."""

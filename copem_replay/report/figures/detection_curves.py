@@ -21,7 +21,7 @@ import pandas as pd
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.limits import CONFIDENCE, NOTHING_DRAWN, OBJECTS, Clusters, find_clusters, weigh_rows
 from copem_replay.metrics.row_figures import FigureRows
-from copem_replay.report.figures.selection import describe_left_out, find_differing
+from copem_replay.report.figures.selection import TOGETHER, describe_left_out, find_differing
 from copem_replay.report.figures.style import (
     Appearance,
     add_note,
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
 _NEARLY = 0.005
 """The axis ends where each curve is within this of its last value: what follows could not be seen."""
-TOGETHER = 6
-"""Most curves in one panel: more hide each other."""
 _COLUMNS, _PANEL_IN = 3, 1.45
 """Panels beside each other, and the height of one."""
 _EXACT: dict[str, Any] = {"color": "black", "linewidth": 0.7, "linestyle": (0, (5, 3))}

@@ -29,6 +29,8 @@ _COLUMNS = 4
 """Configurations side by side unless some are named, as many as in the figures of Piazzoni et al. 2022."""
 MOST_LINES = 12
 """Most configurations in one plot: more cannot be distinguished."""
+TOGETHER = 6
+"""Most curves in one panel: more hide each other."""
 _RANKED_BY = ("time_to_detection_s", "detection_s", *COUNTS_BY, "conflict", "braking_pass")
 _NAMED = 12
 """Most ids named in an error: more would hide its end."""

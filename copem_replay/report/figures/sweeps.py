@@ -1,11 +1,14 @@
 """Figure of sweeps: shares and times to detection over the values of each swept quantity, such as latency or rate.
 
+Of more than six configurations each has panels of its own, with the baseline in every one.
+
 It is drawn from `sweep.csv`, which has the columns of `summary.csv`, and `sweep` and `value` of each row.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +17,7 @@ import pandas as pd
 from copem_replay.core.errors import InputError
 from copem_replay.core.tracks import Float
 from copem_replay.metrics.summary import describe_intervals
-from copem_replay.report.figures.selection import MOST_LINES, describe_left_out
+from copem_replay.report.figures.selection import MOST_LINES, TOGETHER, describe_left_out
 from copem_replay.report.figures.style import (
     Appearance,
     add_note,
@@ -65,31 +68,49 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     kinds = list(dict.fromkeys(sweep["sweep"]))
     if not kinds:
         raise InputError(f"{results.place}/sweep.csv: expected rows of {', '.join(names)}, found none")
-    asked, names = names, _find_differing(sweep, names, find_baseline(results.facts, names).name)
+    baseline = find_baseline(results.facts, names).name
+    asked, names = names, _find_differing(sweep, names, baseline)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
+    groups = [names] if len(names) <= TOGETHER else [(baseline, name) for name in names if name != baseline]
     looks = choose_appearances(results)
     with figure_style():
-        figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
-        panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)
-        for column, kind in zip(panels.T, kinds, strict=True):
+        figure, panels = _lay_out(groups, rows, kinds)
+        for (group, row, kind), axes in zip(product(groups, rows, kinds), panels.flat, strict=True):
             part = sweep[sweep["sweep"] == kind]
-            for axes, row in zip(column, rows, strict=True):
-                for name in names:
-                    series = part[part["configuration"] == name].sort_values("value", kind="stable")
-                    if len(series):
-                        with mark_configuration(list(looks).index(name), axes):
-                            _draw_series(axes, series, row, name, looks[name])
-            _value_axis(column[-1], kind, part)
-        for axes, row in zip(panels[:, 0], rows, strict=True):
-            axes.set_ylabel(_ROWS[row])
+            for name in group:
+                series = part[part["configuration"] == name].sort_values("value", kind="stable")
+                if len(series):
+                    with mark_configuration(list(looks).index(name), axes):
+                        _draw_series(axes, series, row, name, looks[name])
+            if group == groups[-1] and (len(groups) > 1 or row == rows[-1]):
+                _value_axis(axes, kind, part)
             if row != "ttd":
                 axes.set_ylim(-0.03, 1.05)
                 axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")
-        _close_open_bands(panels[-1])
-        _add_legend(figure, panels, kinds, names)
+        for shared in [panels[0, -1]] if len(groups) == 1 else panels[:, -1].T:
+            _close_open_bands(shared)
+        _add_legend(figure, panels.reshape(-1, len(kinds)), kinds, names if len(groups) == 1 else [baseline])
         add_note(figure, [*_note_sentences(results, sweep, kinds, names), describe_left_out(asked, names)])
     return figure
+
+
+def _lay_out(groups: Sequence[Sequence[str]], rows: Sequence[str], kinds: Sequence[str]) -> tuple[Figure, Any]:
+    """A figure and its panels (groups, rows, kinds): of one group in lines of a quantity, of several of a group."""
+    if len(groups) == 1:
+        figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
+        panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)
+        for axes, row in zip(panels[:, 0], rows, strict=True):
+            axes.set_ylabel(_ROWS[row])
+    else:
+        figure = new_figure(2.0 + 1.9 * len(rows) * len(kinds), 1.4 + 1.1 * len(groups))
+        panels = figure.subplots(len(groups), len(rows) * len(kinds), sharex="col", sharey="col", squeeze=False)
+        short = shorten_names([name for group in groups for name in group])
+        for axes, (_, name) in zip(panels[:, 0], groups, strict=True):
+            axes.set_ylabel(short[name])
+        for axes, (row, _) in zip(panels[0], product(rows, kinds), strict=True):
+            axes.set_title(_ROWS[row], loc="left")
+    return figure, panels.reshape(len(groups), len(rows), len(kinds))
 
 
 def _find_differing(sweep: pd.DataFrame, names: Sequence[str], baseline: str) -> tuple[str, ...]:
@@ -108,7 +129,7 @@ def name_in_sweep(name: str, kind: str) -> str:
 
 
 def _add_legend(figure: Figure, panels: Any, kinds: Sequence[str], names: Sequence[str]) -> None:
-    """Add the legend; a configuration drawn in a sweep of latency and in another one has two entries."""
+    """Add the legend of `names`; a configuration drawn in a sweep of latency and in another one has two entries."""
     short = shorten_names(names)
     handles: dict[str, Line2D] = {}
     for name in (*names, "exact"):

@@ -291,10 +291,10 @@ def _difference_cell(row: Any, metric: str) -> Html:
     shown: list[str] = [format_signed_difference(metric, row.difference)]
     if row.star == STAR:
         shown = [make_tag("b", *shown)]
+    shown += [] if pd.isna(row.star) else [f" {row.star}"]
     if pd.notna(row.interval_over):
         times = 100.0 if is_share(metric) else 1.0
         shown.append(interval_markup(*(math.nan if pd.isna(limit) else times * float(limit) for limit in limits)))
-    shown += [] if pd.isna(row.star) else [f" {row.star}"]
     shown += [f" ({why})" for why in explain_no_interval(row)]
     low, high = map(full_number, limits)
     return make_tag(
