@@ -115,15 +115,16 @@ class Show(Frozen):
     """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
 
     `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves
-    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `map: true` adds a
-    view on a map of the world to the .rrd, for which the viewer asks a foreign host for tiles: it learns where the
-    drive was.
+    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `units: false` leaves
+    out the lists of the units with PEMs, the topics `copem/units/…`. `map: true` adds a view on a map of the world to
+    the .rrd, for which the viewer asks a foreign host for tiles: it learns where the drive was.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
     truth: bool = True
+    units: bool = True
     map: Annotated[bool, Field(exclude_if=operator.not_)] = False
 
     def asked(self) -> tuple[WhichRun, ...]:

@@ -12,7 +12,7 @@ captures and full covariances, and these are taken from there.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -59,9 +59,10 @@ _LARGEST_ID = 2**63 - 1
 class _EntryRows:
     """Entries of all lists, in the order of the messages."""
 
-    captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next three
+    captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next four
     arrives: list[int | None] = field(default_factory=list)
     logged: list[int] = field(default_factory=list)
+    in_order: list[bool] = field(default_factory=list)  # whether entries are those of a `…/detail`, in the world
     ahead: list[int] = field(default_factory=list)  # of the clock of the stamps against that of log times
     undecoded: int = 0
     impossible: int = 0  # stamps that are none
@@ -73,6 +74,16 @@ class _EntryRows:
     variances: list[tuple[float, ...]] = field(default_factory=list)
     existence: list[float] = field(default_factory=list)  # NaN: not said
     likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as stated
+
+    def add_crossed(self, details: Mapping[int, Sequence[Any]]) -> None:
+        """Put the covariances of east and north that `details` state into the entries, list by list, in their order."""
+        first = np.searchsorted(self.frame, np.arange(len(self.arrives) + 1)).tolist()
+        for begin, end, stamp_ns, in_order in zip(first[:-1], first[1:], self.arrives, self.in_order, strict=True):
+            items = details.get(stamp_ns or 0, ())
+            if len(items) == end - begin and in_order:
+                for p, item in enumerate(items, start=begin):
+                    east, crossed, *rest = self.variances[p]
+                    self.variances[p] = (east, _get_number(item, "cov_en_m2", crossed), *rest)
 
 
 @dataclass(frozen=True)
@@ -138,7 +149,8 @@ def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None =
 
     Raises RecordingError: no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
-    rows, _ = _read_rows(path, topic, window)
+    rows, details = _read_rows(path, topic, window)
+    rows.add_crossed(details)
     findings: list[str] = [*find("undecoded", rows.undecoded)]
     findings += [line for rule, number in sorted(rows.rules.items()) for line in find(rule, number)]
     times = _settle_times(rows, findings)
@@ -203,8 +215,8 @@ def _make_recorded(
     )  # fmt: skip
 
 
-def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
-    """Entries on `topic`, and details by the time in ns at which their list was available, then by object id."""
+def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, list[Any]]]:
+    """Entries on `topic`, and details of entries by the time in ns at which their list was available."""
     return open_log(path).within(window).attempt(lambda log: _read_messages(log, topic))
 
 
@@ -220,7 +232,7 @@ def _no_lists_message(log: Log, topic: str) -> str:
     return f"{content}; lists of units are on {', '.join(sorted(list_topics))}"
 
 
-def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
+def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, list[Any]]]:
     """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
     if not chosen:
@@ -228,12 +240,12 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
     rows, allowance = _EntryRows(), DecodeAllowance(log.file_bytes())
-    details: dict[int, dict[str, Any]] = {}
+    details: dict[int, list[Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
             with suppress(ValueError, TypeError, KeyError):  # else not written by `copem-replay`
                 content = parse_json(payload)
-                details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
+                details[content["available_ns"]] = [*content["objects"]]
         else:
             try:
                 message_class = load_message_class(SENSOR_DATA)
@@ -257,6 +269,7 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
     frame = len(rows.logged)
     rows.logged.append(min(log_time_ns, LAST_NS))
     rows.ahead.append(ahead_ns)
+    rows.in_order.append(not message.stationary_object and not message.HasField("host_vehicle_location"))
     for name, times in (("timestamp", rows.arrives), ("last_measurement_time", rows.captured)):
         times.append(osi.osi_stamp_ns(getattr(message, name)) if message.HasField(name) else None)
         rows.impossible += message.HasField(name) and times[-1] is None
@@ -340,7 +353,7 @@ def _transform_entry(
     return float(x), float(y), float(z), float(wrap_angles(np.array(yaw))), float(vx), float(vy)
 
 
-def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
+def _make_tracks(rows: _EntryRows, details: Mapping[int, Sequence[Any]], topic: str, scene: Scene) -> Tracks:
     """Tracks by object of `scene` and track id, with the full covariances of `details` where there are any."""
     stamps = _settle_times(rows, []).stamps_ns
     by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
@@ -353,10 +366,12 @@ def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: st
     first = np.flatnonzero(new)
     values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))[order]
     variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))[order]
+    by_id = {at: {one.get("id"): one for one in items if isinstance(one, dict)} for at, items in details.items()}
     for p, (k, f) in enumerate(zip(object_ix[order].tolist(), frame[order].tolist(), strict=True)):
-        item = details.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
+        item = by_id.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
         if item is not None:
-            variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
+            stated = [item.get(name, of) for name, of in zip(UNCERTAINTIES, variances[p], strict=True)]
+            variances[p] = [np.nan if variance is None else variance for variance in stated]
     start = np.append(first, len(order))
     return build_unit_tracks(
         topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances

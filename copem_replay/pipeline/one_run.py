@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, TimeChunk, Tracks
+from copem_replay.core.object_list import COVARIANCES, Entries
+from copem_replay.core.tracks import (
+    SAME_INSTANT_S,
+    TRUTH,
+    UNCERTAINTIES,
+    VALUES,
+    Bool,
+    Float,
+    Int,
+    TimeChunk,
+    Tracks,
+)
 from copem_replay.experiment.schema import Experiment
+from copem_replay.io.encodings.column_bytes import expand_ranges
 from copem_replay.io.recording import Recording
+from copem_replay.io.write.detail import UnitLists
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
-from copem_replay.perception.sensor_poses import find_carrier
+from copem_replay.perception.sensor_poses import couple_polygons, find_carrier
 from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
-from copem_replay.pipeline.receiver import Receivers
+from copem_replay.pipeline.receiver import Receivers, StatedCaptures, remove_truth_ids, state_captures
 from copem_replay.pipeline.scoring import match_run
-from copem_replay.pipeline.world import Transmission
+from copem_replay.pipeline.world import Transmission, WorldChunk
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.run import StudyTables
@@ -40,6 +53,11 @@ class RunTracks:
     run: int
 
     def __iter__(self) -> Iterator[dict[str, FusedTracks]]:
+        for chunk in self.chunks():
+            yield chunk.fused
+
+    def chunks(self) -> Iterator[RunChunk]:
+        """The fused tracks, and the lists of the units that they are made of."""
         if len(self.replay.chunks) == 1:
             yield self._all
         else:
@@ -49,24 +67,26 @@ class RunTracks:
         """The tracks of the whole log. Raises ExperimentError where the log is too long for that."""
         replay = self.replay
         if len(replay.chunks) == 1:
-            return self._all
+            return self._all.fused
         if observation_rows(replay.scene, replay.truth, replay.expanded) > ROWS_HELD:
             raise ExperimentError(f"{replay.scene.log}: too long to be held at once; take a window of it")
         return replace(self, replay=replace(replay, chunks=(TimeChunk(),))).whole()
 
     @cached_property
-    def _all(self) -> dict[str, FusedTracks]:
+    def _all(self) -> RunChunk:
         return next(self._compute())
 
-    def _compute(self) -> Iterator[dict[str, FusedTracks]]:
+    def _compute(self) -> Iterator[RunChunk]:
         replay, measure = self.replay, self.experiment.measure
         units = replay.expand(self.experiment)
         [group] = group_runs(units, replay.scene.log, np.array([self.run]))
-        receivers = Receivers(Transmission(replay, units, group))
+        lists = Transmission(replay, units, group)
+        receivers = Receivers(lists)
         for world in receivers.worlds():
-            truth_cache, result = replay.truth_cache_of(world.chunk), {}
+            truth_cache, result, arriving = replay.truth_cache_of(world.chunk), {}, dict[str, Tracks]()
             for name in units.configurations:
                 output = receivers.fuse(world, name)
+                arriving[name] = lists.arriving(name)
                 matches = match_run(truth_cache, output, measure) if output.fused_tracks is None else None
                 [(_, fused_tracks)] = output.tracks_by_run(matches)
                 if output.faults is not None:
@@ -74,7 +94,78 @@ class RunTracks:
                 if linked := units.linked(name):
                     fused_tracks = replace(fused_tracks, by_link=_is_sent_by_link(output.sent, linked, group))
                 result[name] = fused_tracks
-            yield result
+            yield RunChunk(result, partial(collect_unit_lists, world, lists, arriving))
+
+
+class RunChunk(NamedTuple):
+    """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
+
+    fused: dict[str, FusedTracks]
+    unit_lists: Callable[[], list[UnitLists]]
+
+
+def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[UnitLists]:
+    """What the units with PEMs have ready to send in a time chunk of one run, as fusions without truth ids get it.
+
+    `arriving`: by configuration the lists by when they reach its receiver.
+    """
+    chunk, experiment, every = world.chunk, world.experiment, sent.lists
+    ready_s = every.common_arrives_s
+    ready = np.isfinite(ready_s) & (ready_s >= chunk.from_s) & (ready_s < chunk.until_s)
+    earliest_s = float(every.captured_s[ready].min(initial=np.inf)) - SAME_INSTANT_S
+    if earliest_s < world.earliest_s:
+        world = sent.world(chunk, earliest_s)
+    if experiment.draws_claims and not experiment.runs_apart:
+        world = replace(world, claiming=True, _listed={}, _sent={})
+    entries, _, rows = remove_truth_ids(world)
+    stated = state_captures(world.scene, every, experiment, int(world.group.runs[0]))
+    result = []
+    for name, sends in zip(every.units, world.group.sending, strict=True):
+        if name in experiment.modelled and sends:
+            frames = np.flatnonzero(ready & (every.frame_unit_ix == every.units.index(name)))
+            frames = frames[np.argsort(ready_s[frames], kind="stable")]
+            start, places = expand_ranges(entries.start[0], frames)
+            lists = _make_unit_tracks(world, name, frames, start, entries.entries[places], rows[places], stated)
+            heard = (c for c, of in experiment.configurations.items() if name in experiment.units_of(of))
+            poses, at = (
+                world.log.placed.poses[name],
+                np.searchsorted(world.log.placed.stamps_ns[name], every.stamp_ns[frames]),
+            )
+            pem = experiment.pems[str(experiment.units[name].pem)]
+            result.append(
+                UnitLists(
+                    name,
+                    lists,
+                    None if stated is None else every.stamp_ns[frames],
+                    {c: arriving[c].common_arrives_s[frames] for c in heard},
+                    couple_polygons(pem.couples),
+                    np.stack([poses.x_m, poses.y_m, poses.ground_m, poses.heading_rad])[:, at],
+                    pem.tracks is not None,
+                )
+            )
+    return result
+
+
+def _make_unit_tracks(
+    world: WorldChunk, name: str, frames: Int, start: Int, entries: Entries, rows: Int, stated: StatedCaptures | None
+) -> FusedTracks:
+    """The entries (P,) of some lists of a unit as tracks, each one of its own; `rows (P,)`: of what units send."""
+    seen = world.sent("sampled")
+    captured_s = (seen.captured_s if stated is None else stated.stated_s)[frames]
+    columns: dict[str, Any] = {
+        of: None if (column := getattr(seen, of)) is None else column[:, rows] for of in UNCERTAINTIES
+    }
+    columns |= {of: entries[of][None] for of in (*VALUES, *COVARIANCES)}
+    frame_ix, none = np.repeat(np.arange(len(frames)), np.diff(start)), np.zeros(len(rows), dtype=np.int64)
+    tracks = Tracks(
+        units=(name,), start=np.arange(len(rows) + 1), unit_ix=none, object_ix=seen.row_object_ix[rows],
+        frame_ix=frame_ix, stamp_ns=world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64),
+        captured_s=captured_s, frame_unit_ix=np.zeros(len(frames), dtype=np.int64),
+        arrives_s=seen.arrives_s[:, frames], valid=np.ones((1, len(rows)), dtype=bool), **columns,
+    )  # fmt: skip
+    said = entries.copy()
+    said["unit_ix"], said["captured_s"] = 0, captured_s[frame_ix]
+    return FusedTracks(tracks, tracks, none[:0], np.zeros(len(rows) + 1, dtype=np.int64), said=said)
 
 
 def _is_sent_by_link(sent: Tracks, linked: list[str], group: RunGroup) -> Bool:

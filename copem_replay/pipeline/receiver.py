@@ -43,7 +43,7 @@ from copem_replay.fusion.ideal import (
     keep_by_object,
 )
 from copem_replay.fusion.ideal_memory import remember_states
-from copem_replay.fusion.inputs import add_kept_entries, listed_rows, make_entry_lists, make_inputs
+from copem_replay.fusion.inputs import add_kept_entries, make_entry_lists, make_inputs
 from copem_replay.fusion.interface import (
     IdealFusion,
     ListFusion,
@@ -423,7 +423,7 @@ class Receivers:
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        lists, same = remove_truth_ids(world)
+        lists, same, _ = remove_truth_ids(world)
         stated, captured_s = self._state_captures(received), None
         if stated is not None:
             lists, captured_s = stated.as_told(lists), stated.stated_s
@@ -545,10 +545,11 @@ class Reach:
         return earliest_s
 
 
-def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:
+def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int, Int]:
     """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
+    Third, (N,): the row of each entry.
     """
     experiment, seen, recorded = world.experiment, world.sent("sampled"), world.recorded
     rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
@@ -559,9 +560,8 @@ def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:
         claims = claims.followed_by(EntryClaims(recorded.existence, recorded.class_probability, recorded.track_id))
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
     drawn = rng.uniform("order in the list", random_key, world.group.runs)
-    lists = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
+    lists, picked = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, np.empty(0, dtype=np.int64)
-    picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
+        return lists, np.empty(0, dtype=np.int64), picked
     pairs = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
-    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel()
+    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), picked
