@@ -30,6 +30,7 @@ from copem_replay.communication.sends import Sends
 from copem_replay.core.components import (
     Count,
     Either,
+    Flag,
     Frozen,
     Id,
     Latency,
@@ -123,9 +124,9 @@ class Show(Frozen):
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-    truth: bool = True
-    units: bool = True
-    map: Annotated[bool, Field(exclude_if=operator.not_)] = False
+    truth: Flag = True
+    units: Flag = True
+    map: Annotated[Flag, Field(exclude_if=operator.not_)] = False
 
     def asked(self) -> tuple[WhichRun, ...]:
         """The runs in their order: several, one or none."""

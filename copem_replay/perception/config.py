@@ -199,6 +199,14 @@ class Obstacle(Frozen):
         return self
 
 
+class Outlined(Protocol):
+    """An area with the rings of its polygon, the outer first."""
+
+    @property
+    def rings_m(self) -> tuple[tuple[Point, ...], ...]:
+        """Without the first corner again."""
+
+
 class PerceptionSetup(Protocol):
     """What perception reads of an experiment."""
 
@@ -225,6 +233,10 @@ class PerceptionSetup(Protocol):
     @property
     def modelled(self) -> Mapping[str, Placement]:
         """The units with a PEM, by name."""
+
+    @property
+    def areas(self) -> Mapping[str, Outlined]:
+        """Areas of the experiment by name, beside those of the log's maps."""
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
