@@ -442,7 +442,7 @@ class Experiment(Frozen):
     `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
     [from, to] in log time since the first message of its truth. `tags`: those of all logs, to slice the summary by
     (`measure.by`) and for conditions of PEMs; a log may have others. `frame`: where the logs are on earth. `maps` of
-    the site: lanes, areas, solids. `areas`: your own, by name, for `measure.objects.within.areas`.
+    the site: lanes, areas, solids. `areas`: your own, by name, for `measure.objects.within.areas` and ghosts.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed

@@ -62,7 +62,7 @@ class _EntryRows:
     captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next four
     arrives: list[int | None] = field(default_factory=list)
     logged: list[int] = field(default_factory=list)
-    in_order: list[bool] = field(default_factory=list)  # whether entries are those of a `…/detail`, in the world
+    still: list[set[int]] = field(default_factory=list)  # ground truth ids of stationary objects
     ahead: list[int] = field(default_factory=list)  # of the clock of the stamps against that of log times
     undecoded: int = 0
     impossible: int = 0  # stamps that are none
@@ -75,15 +75,15 @@ class _EntryRows:
     existence: list[float] = field(default_factory=list)  # NaN: not said
     likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as stated
 
-    def add_crossed(self, details: Mapping[int, Sequence[Any]]) -> None:
-        """Put the covariances of east and north that `details` state into the entries, list by list, in their order."""
+    def add_details(self, details: Mapping[int, Sequence[Any]]) -> None:
+        """Take the variances that a topic `…/detail` states, by the time in ns at which each list was available."""
         first = np.searchsorted(self.frame, np.arange(len(self.arrives) + 1)).tolist()
-        for begin, end, stamp_ns, in_order in zip(first[:-1], first[1:], self.arrives, self.in_order, strict=True):
-            items = details.get(stamp_ns or 0, ())
-            if len(items) == end - begin and in_order:
-                for p, item in enumerate(items, start=begin):
-                    east, crossed, *rest = self.variances[p]
-                    self.variances[p] = (east, _get_number(item, "cov_en_m2", crossed), *rest)
+        for begin, end, stamp_ns, still in zip(first[:-1], first[1:], self.arrives, self.still, strict=True):
+            items = [item for item in details.get(stamp_ns or 0, ()) if isinstance(item, dict)]
+            items.sort(key=lambda item: osi_id(str(item.get("id"))) in still)  # stationary ones are last in messages
+            for p, item in zip(range(begin, end), items if len(items) == end - begin else (), strict=False):
+                stated = (item.get(name, of) for name, of in zip(UNCERTAINTIES, self.variances[p], strict=True))
+                self.variances[p] = tuple(np.nan if variance is None else variance for variance in stated)
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def read_sensor_data(path: Local, topic: str, scene: Scene) -> Tracks:
 
     Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
-    return _make_tracks(*_read_rows(path, topic), topic, scene)
+    return _make_tracks(_read_rows(path, topic), topic, scene)
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,7 @@ def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None =
 
     Raises RecordingError: no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
-    rows, details = _read_rows(path, topic, window)
-    rows.add_crossed(details)
+    rows = _read_rows(path, topic, window)
     findings: list[str] = [*find("undecoded", rows.undecoded)]
     findings += [line for rule, number in sorted(rows.rules.items()) for line in find(rule, number)]
     times = _settle_times(rows, findings)
@@ -215,8 +214,8 @@ def _make_recorded(
     )  # fmt: skip
 
 
-def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, list[Any]]]:
-    """Entries on `topic`, and details of entries by the time in ns at which their list was available."""
+def _read_rows(path: Local, topic: str, window: Window | None = None) -> _EntryRows:
+    """Entries on `topic`, with the variances that a topic `…/detail` beside it states."""
     return open_log(path).within(window).attempt(lambda log: _read_messages(log, topic))
 
 
@@ -232,7 +231,7 @@ def _no_lists_message(log: Log, topic: str) -> str:
     return f"{content}; lists of units are on {', '.join(sorted(list_topics))}"
 
 
-def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, list[Any]]]:
+def _read_messages(log: Log, topic: str) -> _EntryRows:
     """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
     if not chosen:
@@ -261,7 +260,8 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, list[Any
             _add_message(rows, message, log_time_ns, chosen[number].ahead_ns)
     if rows.undecoded and not rows.logged:
         raise RecordingError(f"none of its {rows.undecoded} messages can be decoded", path=log.path, topic=topic)
-    return rows, details
+    rows.add_details(details)
+    return rows
 
 
 def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int) -> None:
@@ -269,7 +269,7 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
     frame = len(rows.logged)
     rows.logged.append(min(log_time_ns, LAST_NS))
     rows.ahead.append(ahead_ns)
-    rows.in_order.append(not message.stationary_object and not message.HasField("host_vehicle_location"))
+    rows.still.append({of.value for item in message.stationary_object for of in item.header.ground_truth_id})
     for name, times in (("timestamp", rows.arrives), ("last_measurement_time", rows.captured)):
         times.append(osi.osi_stamp_ns(getattr(message, name)) if message.HasField(name) else None)
         rows.impossible += message.HasField(name) and times[-1] is None
@@ -353,8 +353,8 @@ def _transform_entry(
     return float(x), float(y), float(z), float(wrap_angles(np.array(yaw))), float(vx), float(vy)
 
 
-def _make_tracks(rows: _EntryRows, details: Mapping[int, Sequence[Any]], topic: str, scene: Scene) -> Tracks:
-    """Tracks by object of `scene` and track id, with the full covariances of `details` where there are any."""
+def _make_tracks(rows: _EntryRows, topic: str, scene: Scene) -> Tracks:
+    """Tracks by object of `scene` and track id."""
     stamps = _settle_times(rows, []).stamps_ns
     by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     object_by_id = {osi_id(name): k for k, name in enumerate(scene.object_ids)}
@@ -366,12 +366,6 @@ def _make_tracks(rows: _EntryRows, details: Mapping[int, Sequence[Any]], topic: 
     first = np.flatnonzero(new)
     values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))[order]
     variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))[order]
-    by_id = {at: {one.get("id"): one for one in items if isinstance(one, dict)} for at, items in details.items()}
-    for p, (k, f) in enumerate(zip(object_ix[order].tolist(), frame[order].tolist(), strict=True)):
-        item = by_id.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
-        if item is not None:
-            stated = [item.get(name, of) for name, of in zip(UNCERTAINTIES, variances[p], strict=True)]
-            variances[p] = [np.nan if variance is None else variance for variance in stated]
     start = np.append(first, len(order))
     return build_unit_tracks(
         topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances

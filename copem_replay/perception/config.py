@@ -199,14 +199,6 @@ class Obstacle(Frozen):
         return self
 
 
-class Outlined(Protocol):
-    """An area with the rings of its polygon, the outer first."""
-
-    @property
-    def rings_m(self) -> tuple[tuple[Point, ...], ...]:
-        """Without the first corner again."""
-
-
 class PerceptionSetup(Protocol):
     """What perception reads of an experiment."""
 
@@ -235,8 +227,8 @@ class PerceptionSetup(Protocol):
         """The units with a PEM, by name."""
 
     @property
-    def areas(self) -> Mapping[str, Outlined]:
-        """Areas of the experiment by name, beside those of the log's maps."""
+    def areas(self) -> Mapping[str, Any]:
+        """Areas of the experiment by name, with their `rings_m`, beside those of the log's maps."""
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:

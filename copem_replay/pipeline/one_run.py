@@ -12,28 +12,24 @@ import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
-from copem_replay.core.object_list import COVARIANCES, Entries
-from copem_replay.core.tracks import (
-    SAME_INSTANT_S,
-    TRUTH,
-    UNCERTAINTIES,
-    VALUES,
-    Bool,
-    Float,
-    Int,
-    TimeChunk,
-    Tracks,
-)
+from copem_replay.core.object_list import Entries
+from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, TimeChunk, Tracks
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.encodings.column_bytes import expand_ranges
 from copem_replay.io.recording import Recording
-from copem_replay.io.write.detail import UnitLists
+from copem_replay.io.write.detail import SentLists
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import couple_polygons, find_carrier
 from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
-from copem_replay.pipeline.receiver import Receivers, StatedCaptures, remove_truth_ids, state_captures
+from copem_replay.pipeline.receiver import (
+    Receivers,
+    StatedCaptures,
+    make_entry_tracks,
+    remove_truth_ids,
+    state_captures,
+)
 from copem_replay.pipeline.scoring import match_run
 from copem_replay.pipeline.world import Transmission, WorldChunk
 
@@ -101,10 +97,10 @@ class RunChunk(NamedTuple):
     """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
 
     fused: dict[str, FusedTracks]
-    unit_lists: Callable[[], list[UnitLists]]
+    unit_lists: Callable[[], list[SentLists]]
 
 
-def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[UnitLists]:
+def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[SentLists]:
     """What the units with PEMs have ready to send in a time chunk of one run, as fusions without truth ids get it.
 
     `arriving`: by configuration the lists by when they reach its receiver.
@@ -127,22 +123,13 @@ def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[
             start, places = expand_ranges(entries.start[0], frames)
             lists = _make_unit_tracks(world, name, frames, start, entries.entries[places], rows[places], stated)
             heard = (c for c, of in experiment.configurations.items() if name in experiment.units_of(of))
-            poses, at = (
-                world.log.placed.poses[name],
-                np.searchsorted(world.log.placed.stamps_ns[name], every.stamp_ns[frames]),
-            )
-            pem = experiment.pems[str(experiment.units[name].pem)]
-            result.append(
-                UnitLists(
-                    name,
-                    lists,
-                    None if stated is None else every.stamp_ns[frames],
-                    {c: arriving[c].common_arrives_s[frames] for c in heard},
-                    couple_polygons(pem.couples),
-                    np.stack([poses.x_m, poses.y_m, poses.ground_m, poses.heading_rad])[:, at],
-                    pem.tracks is not None,
-                )
-            )
+            arrives_s = {c: arriving[c].common_arrives_s[frames] for c in heard}
+            poses, pem = world.log.placed.poses[name], experiment.pems[str(experiment.units[name].pem)]
+            at = np.searchsorted(world.log.placed.stamps_ns[name], every.stamp_ns[frames])
+            posed = np.stack([poses.x_m, poses.y_m, poses.ground_m, poses.heading_rad])[:, at]
+            true_ns = None if stated is None else every.stamp_ns[frames]
+            fields, has_ids = couple_polygons(pem.couples), pem.tracks is not None
+            result.append(SentLists(name, lists, true_ns, arrives_s, fields, posed, has_ids))
     return result
 
 
@@ -150,22 +137,15 @@ def _make_unit_tracks(
     world: WorldChunk, name: str, frames: Int, start: Int, entries: Entries, rows: Int, stated: StatedCaptures | None
 ) -> FusedTracks:
     """The entries (P,) of some lists of a unit as tracks, each one of its own; `rows (P,)`: of what units send."""
-    seen = world.sent("sampled")
+    seen, frame_ix, said = world.sent("sampled"), np.repeat(np.arange(len(frames)), np.diff(start)), entries.copy()
     captured_s = (seen.captured_s if stated is None else stated.stated_s)[frames]
-    columns: dict[str, Any] = {
-        of: None if (column := getattr(seen, of)) is None else column[:, rows] for of in UNCERTAINTIES
-    }
-    columns |= {of: entries[of][None] for of in (*VALUES, *COVARIANCES)}
-    frame_ix, none = np.repeat(np.arange(len(frames)), np.diff(start)), np.zeros(len(rows), dtype=np.int64)
-    tracks = Tracks(
-        units=(name,), start=np.arange(len(rows) + 1), unit_ix=none, object_ix=seen.row_object_ix[rows],
-        frame_ix=frame_ix, stamp_ns=world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64),
-        captured_s=captured_s, frame_unit_ix=np.zeros(len(frames), dtype=np.int64),
-        arrives_s=seen.arrives_s[:, frames], valid=np.ones((1, len(rows)), dtype=bool), **columns,
-    )  # fmt: skip
-    said = entries.copy()
     said["unit_ix"], said["captured_s"] = 0, captured_s[frame_ix]
-    return FusedTracks(tracks, tracks, none[:0], np.zeros(len(rows) + 1, dtype=np.int64), said=said)
+    stamps = world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64), captured_s, seen.common_arrives_s[frames]
+    tracks = make_entry_tracks(name, said, np.arange(len(rows) + 1), seen.row_object_ix[rows], frame_ix, stamps)
+    more: dict[str, Any] = {of: getattr(seen, of) for of in ("yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")}
+    more = {of: None if column is None else column[:, rows] for of, column in more.items()}
+    none = np.zeros(len(rows) + 1, dtype=np.int64)
+    return FusedTracks(replace(tracks, **more), tracks, none[:0], none, said=said)
 
 
 def _is_sent_by_link(sent: Tracks, linked: list[str], group: RunGroup) -> Bool:

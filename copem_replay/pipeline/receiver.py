@@ -19,7 +19,7 @@ from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fus
 from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.fused_tracks import EntrySources, FusedTracks, find_newest_and_first
 from copem_replay.core.interpolation import AROUND_S
-from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists, TellsOf
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, ObjectLists, TellsOf
 from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import (
     NO_CAPTURE_NS,
@@ -180,23 +180,25 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     start = np.append(np.flatnonzero(new), len(order))
     stamps = np.where(newest >= 0, received.stamp_ns[newest], NO_CAPTURE_NS).max(axis=1, initial=NO_CAPTURE_NS)
     captured = np.where(newest >= 0, received.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
-    fused = Tracks(
-        units=("fused",),
-        start=start,
-        unit_ix=np.zeros(len(start) - 1, dtype=np.int64),
-        object_ix=object_ix[order][start[:-1]],
-        frame_ix=frame[order],
-        stamp_ns=stamps,
-        captured_s=captured,
-        frame_unit_ix=np.zeros(len(issue_s), dtype=np.int64),
-        arrives_s=issue_s[None],
-        valid=np.ones((1, len(order)), dtype=bool),
-        **{name: entries[name][order][None] for name in (*VALUES, *COVARIANCES)},
-    )
+    captures = stamps, captured, issue_s
+    fused = make_entry_tracks("fused", entries[order], start, object_ix[order][start[:-1]], frame[order], captures)
     none = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
     second_of = np.where(matches.role[first:last] == DUPLICATE, matches.object_ix[first:last], -1)[order]
     return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s, second_of=second_of)
+
+
+def make_entry_tracks(
+    unit: str, entries: Entries, start: Int, object_ix: Int, frame_ix: Int, times: tuple[Int, Float, Float]
+) -> Tracks:
+    """Entries (P,) as tracks (E,) of one run; `times`: captures of lists (F,) in ns and in s, and arrivals in s."""
+    return Tracks(
+        units=(unit,), start=start, unit_ix=np.zeros(len(object_ix), dtype=np.int64), object_ix=object_ix,
+        frame_ix=frame_ix, stamp_ns=times[0], captured_s=times[1],
+        frame_unit_ix=np.zeros(len(times[0]), dtype=np.int64), arrives_s=times[2][None],
+        valid=np.ones((1, len(frame_ix)), dtype=bool),
+        **{name: entries[name][None] for name in (*VALUES, *COVARIANCES)},
+    )  # fmt: skip
 
 
 # Stated captures: when lists were captured, as fusions are told of it.

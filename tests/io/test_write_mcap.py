@@ -73,7 +73,8 @@ class Written:
     def write(self, path: Path, source: Path = SOURCE) -> list[str]:
         manifest = {"experiment": "version: 1", "run": str(RUN)}
         colours = configuration_colours(self.run_tracks, ())
-        return write_mcap(path, source, self.replay.scene, [(self.run_tracks, ())], self.table, manifest, colours=colours)
+        tracks, scene = [(self.run_tracks, ())], self.replay.scene
+        return write_mcap(path, source, scene, tracks, self.table, manifest, colours=colours)
 
 
 @pytest.fixture(scope="module")
