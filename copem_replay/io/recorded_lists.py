@@ -83,7 +83,7 @@ class _EntryRows:
             items.sort(key=lambda item: osi_id(str(item.get("id"))) in still)  # stationary ones are last in messages
             for p, item in zip(range(begin, end), items if len(items) == end - begin else (), strict=False):
                 stated = (item.get(name, of) for name, of in zip(UNCERTAINTIES, self.variances[p], strict=True))
-                self.variances[p] = tuple(np.nan if variance is None else variance for variance in stated)
+                self.variances[p] = tuple(of if isinstance(of, int | float) else np.nan for of in stated)
 
 
 @dataclass(frozen=True)
