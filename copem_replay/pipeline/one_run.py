@@ -17,7 +17,7 @@ from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, Ti
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.encodings.column_bytes import expand_ranges
 from copem_replay.io.recording import Recording
-from copem_replay.io.write.detail import SentLists
+from copem_replay.io.write.detail import ReadyLists
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
 from copem_replay.perception.sensor_poses import couple_polygons, find_carrier
@@ -97,10 +97,10 @@ class RunChunk(NamedTuple):
     """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
 
     fused: dict[str, FusedTracks]
-    unit_lists: Callable[[], list[SentLists]]
+    unit_lists: Callable[[], list[ReadyLists]]
 
 
-def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[SentLists]:
+def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[ReadyLists]:
     """What the units with PEMs have ready to send in a time chunk of one run, as fusions without truth ids get it.
 
     `arriving`: by configuration the lists by when they reach its receiver.
@@ -129,7 +129,7 @@ def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[
             posed = np.stack([poses.x_m, poses.y_m, poses.ground_m, poses.heading_rad])[:, at]
             true_ns = None if stated is None else every.stamp_ns[frames]
             fields, has_ids = couple_polygons(pem.couples), pem.tracks is not None
-            result.append(SentLists(name, lists, true_ns, arrives_s, fields, posed, has_ids))
+            result.append(ReadyLists(name, lists, true_ns, arrives_s, fields, posed, has_ids))
     return result
 
 

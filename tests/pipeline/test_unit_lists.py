@@ -18,7 +18,7 @@ from osi3.osi_sensordata_pb2 import SensorData
 import copem_replay as cr
 from copem_replay.api.study import make_study
 from copem_replay.core.tracks import TimeChunk
-from copem_replay.io.write.detail import SentLists
+from copem_replay.io.write.detail import ReadyLists
 from copem_replay.pipeline.one_run import replay_run
 from tests.io.test_write_ros2 import drive
 
@@ -149,7 +149,7 @@ def test_they_can_be_left_out(tmp_path: Path) -> None:
     assert not any(channel.topic.startswith("copem/units/") for channel in summary.channels.values())
 
 
-def unit_lists(data: dict[str, Any], *cuts_s: float) -> Iterator[list[SentLists]]:
+def unit_lists(data: dict[str, Any], *cuts_s: float) -> Iterator[list[ReadyLists]]:
     study = make_study(data, LOG)
     one = replay_run(study.recordings[0], study.experiment, 0)
     bounds = [-np.inf, *cuts_s, np.inf]

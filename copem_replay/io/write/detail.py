@@ -8,7 +8,7 @@ is there where a fusion was told of clocks that are off. Objects are in the orde
 or outages, `ghosts` are the entries about no object in the lists that came in with this one, and `down` the units whose
 last list was not made.
 
-Beside the lists of a unit, `copem/units/<name>/objects`, it has what their messages leave out (`SentLists`).
+Beside the lists of a unit, `copem/units/<name>/objects`, it has what their messages leave out (`ReadyLists`).
 
 `status` has the status of each measured object at each list, for State Transitions panels. An object is known as the
 detections table has it: from `detection_s` on, while the newest list holds it.
@@ -278,7 +278,7 @@ class DetailWriter:
 
 
 @dataclass(frozen=True)
-class SentLists:
+class ReadyLists:
     """The lists (F,) of one unit in one run, in the order in which it has them ready, entry by entry in `lists.fused`.
 
     Without the entry about the ego, which no receiver here takes in. `lists.fused.stamp_ns`: captures as the unit
@@ -316,7 +316,7 @@ class UnitDetailWriter:
     The `id` of an entry is that of the true object it is about, null: of none.
     """
 
-    def __init__(self, scene: Scene, unit: SentLists, beside: Mapping[str, Float]) -> None:
+    def __init__(self, scene: Scene, unit: ReadyLists, beside: Mapping[str, Float]) -> None:
         self._names, self._unit, self._beside = TextPool.of(scene.object_ids), unit, beside
         self._stamp = partial(_state_instants, scene.t0_ns)
 

@@ -40,7 +40,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Int, Scene, Tracks
 from copem_replay.io.open import Local
 from copem_replay.io.window import Window
-from copem_replay.io.write.detail import Event, SentLists, Statuses
+from copem_replay.io.write.detail import Event, ReadyLists, Statuses
 from copem_replay.io.write.message_family import (
     OSI,
     RUN_RECORD,
@@ -67,7 +67,7 @@ _EVENT_TIMES = ("onset_s", "captured_s", "time_to_detection_s", "distance_at_det
 """Columns of the detections table that the event of a detection tells of."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
-RunLists = tuple[Mapping[str, FusedTracks], Sequence[SentLists]]
+RunLists = tuple[Mapping[str, FusedTracks], Sequence[ReadyLists]]
 """The fused tracks of one run by configuration, and the lists of its units."""
 
 

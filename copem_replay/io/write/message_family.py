@@ -37,7 +37,7 @@ from copem_replay.io.write.detail import (
     STATUS_SCHEMA,
     DetailWriter,
     Event,
-    SentLists,
+    ReadyLists,
     Statuses,
     StatusWriter,
     UnitDetailWriter,
@@ -136,7 +136,7 @@ class OpenedFamily(ABC):
         """The writers of the lists, and of their details."""
 
     @abstractmethod
-    def _unit_lists(self, unit: SentLists) -> list[ListWriter]:
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
         """The writers of a unit's lists, and of their details."""
 
     @staticmethod
@@ -158,7 +158,7 @@ class OpenedFamily(ABC):
         described = f"fused object list of configuration {name}"
         return dict(zip((self._channel(topic, kind, described) for topic, kind in kinds), writers, strict=True))
 
-    def unit_channels(self, unit: SentLists) -> dict[int, ListWriter]:
+    def unit_channels(self, unit: ReadyLists) -> dict[int, ListWriter]:
         """The channels of a unit's lists: `objects`, `detail`."""
         kinds = zip(list_unit_topics(unit.name), ("tracks" if unit.has_ids else "objects", "detail"), strict=True)
         described = f"object list of unit {unit.name}"
@@ -209,7 +209,7 @@ class _OsiFamily(OpenedFamily):
         scene = self._scene
         return [SensorDataWriter(scene, fused_tracks, self._units), DetailWriter(scene, fused_tracks, events)]
 
-    def _unit_lists(self, unit: SentLists) -> list[ListWriter]:
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
         areas, crossed = unit.draw_areas if unit.fields else None, unit.lists.fused.cov_en_m2
         beside = {} if crossed is None else {"cov_en_m2": crossed[0]}
         objects = SensorDataWriter(self._scene, unit.lists, self._units, areas)
@@ -263,7 +263,7 @@ class _Ros2Family(OpenedFamily):
         objects = ObjectsWriter(self._scene, fused_tracks, self._frame_id)
         return [objects, _StringWriter(DetailWriter(self._scene, fused_tracks, events, sizes_of=objects.round))]
 
-    def _unit_lists(self, unit: SentLists) -> list[ListWriter]:
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
         objects, fused = ObjectsWriter(self._scene, unit.lists, self._frame_id, tracked=unit.has_ids), unit.lists.fused
         assert unit.lists.said is not None
         beside = {n: np.where(objects.round, getattr(fused, n)[0], 0.0) for n in ("length_m", "width_m")}
