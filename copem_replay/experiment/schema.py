@@ -30,6 +30,7 @@ from copem_replay.communication.sends import Sends
 from copem_replay.core.components import (
     Count,
     Either,
+    Flag,
     Frozen,
     Id,
     Latency,
@@ -115,17 +116,19 @@ class Show(Frozen):
     """Which logs, run or runs, and configurations (by default all) are written to MCAP and .rrd.
 
     `run: null` writes none; `pipeline/one_run.py` says which run is `median`, `worst` or `best`. `truth: false` leaves
-    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `map: true` adds a
-    view on a map of the world to the .rrd, for which the viewer asks a foreign host for tiles: it learns where the
-    drive was. `with_recording: true` adds images and points of the recording, as large as they are.
+    the drawn truth out of the MCAP, the topics `copem/truth/…`; the recorded one is always in it. `units: false` leaves
+    out the lists of the units, the topics `copem/units/…`. `map: true` adds a view on a map of the world to the .rrd,
+    for which the viewer asks a foreign host for tiles: it learns where the drive was. `with_recording: true` adds
+    images and points of the recording, as large as they are.
     """
 
     logs: Annotated[tuple[Id, ...], Field(min_length=1)] = ("first",)
     run: WhichRun | Annotated[tuple[WhichRun, ...], Field(min_length=1), AfterValidator(_check_runs_unique)] | None = 0
     configurations: Annotated[tuple[Id, ...], Field(min_length=1)] | None = None
-    truth: bool = True
-    map: Annotated[bool, Field(exclude_if=operator.not_)] = False
-    with_recording: Annotated[bool, Field(exclude_if=operator.not_)] = False
+    truth: Flag = True
+    units: Flag = True
+    map: Annotated[Flag, Field(exclude_if=operator.not_)] = False
+    with_recording: Annotated[Flag, Field(exclude_if=operator.not_)] = False
 
     def asked(self) -> tuple[WhichRun, ...]:
         """The runs in their order: several, one or none."""
@@ -468,7 +471,7 @@ class Experiment(Frozen):
     `logs`: paths or URLs, or mappings with settings for one log. `window_s`: the part of each log that is read,
     [from, to] in log time since the first message of its truth. `tags`: those of all logs, to slice the summary by
     (`measure.by`) and for conditions of PEMs; a log may have others. `frame`: where the logs are on earth. `maps` of
-    the site: lanes, areas, solids. `areas`: your own, by name, for `measure.objects.within.areas`.
+    the site: lanes, areas, solids. `areas`: your own, by name, for `measure.objects.within.areas` and ghosts.
 
     >>> experiment = cr.Experiment(version=1, runs=20, configurations={"GT": cr.Configuration(units="truth")})
     >>> experiment.model_copy(update={"runs": 50}).runs, experiment.seed

@@ -60,6 +60,7 @@ from copem_replay.io.recording import KnownLog, Recording, find_middle, moving_i
 from copem_replay.metrics.config import AREA, NO_AREAS, parse_slices
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
+from copem_replay.perception.pem.model import AreaPlace
 from copem_replay.perception.sensor_poses import find_enclosing_solid
 
 
@@ -87,9 +88,10 @@ def check_against_log(
     if not studied and within is not None and within.of_ego:
         yield ("measure", "objects", "within"), "no ego in this study, and so no path of it; give `polygon_m`"
     known_areas = (*experiment.areas, *(name for area in scene.areas for name in (area.kind, area.name)))
-    for k, name in enumerate((within.areas if within is not None else None) or ()):
-        if name not in known_areas:
-            yield ("measure", "objects", "within", "areas", k), unknown_name_message("area", name, known_areas)
+    for key, areas in _list_named_areas(experiment):
+        for k, name in enumerate(areas):
+            if name not in known_areas:
+                yield (*key, k), unknown_name_message("area", name, known_areas)
     known_lanes = [*(lane.kind for lane in recording.lanes), *(lane.id for lane in recording.lanes)]
     for k, name in enumerate((within.lanes if within is not None else None) or ()):
         if name not in known_lanes:
@@ -115,6 +117,16 @@ def check_against_log(
         on_ego = ("ego", scene.object_ids[scene.ego_ix])
         if not any(unit.on in on_ego for unit in experiment.units.values()):
             yield ("measure", "onset"), f"{onset.kind} needs a unit on the ego; or use line_of_sight_any"
+
+
+def _list_named_areas(experiment: Experiment) -> Iterator[tuple[Key, Sequence[str]]]:
+    """Keys that name areas, and the names."""
+    if (within := experiment.measure.objects.within) is not None:
+        yield ("measure", "objects", "within", "areas"), within.areas or ()
+    for name in sorted({str(unit.pem) for unit in experiment.modelled.values()}):
+        for k, ghosts in enumerate(experiment.pems[name].ghosts):
+            if isinstance(ghosts.where, AreaPlace):
+                yield ("pems", name, "ghosts", k, "where", "areas"), ghosts.where.areas
 
 
 def _check_units_in_solids(experiment: Experiment, recording: Recording) -> Iterator[tuple[Key, str]]:

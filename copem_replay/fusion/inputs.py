@@ -18,11 +18,13 @@ from copem_replay.fusion.ideal import floor_covariances
 from copem_replay.perception.perceive import EntryClaims
 
 
-def make_entry_lists(seen: Tracks, claims: EntryClaims, drawn: Float, *, without_object_ix: int) -> ObjectLists:
-    """The lists of the runs (S,) with their rows (P,) as entries, in the order of `drawn (S, P)`."""
+def make_entry_lists(
+    seen: Tracks, claims: EntryClaims, drawn: Float, *, without_object_ix: int
+) -> tuple[ObjectLists, Int]:
+    """The lists of the runs (S,) with their rows (P,) as entries, in the order of `drawn (S, P)`; their rows (N,)."""
     columns = {name: getattr(seen, name) for name in VALUES}
     columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
-    start, picked = listed_rows(seen, drawn, without_object_ix=without_object_ix)
+    start, picked = _list_rows(seen, drawn, without_object_ix=without_object_ix)
     rows = np.zeros(len(seen.frame_ix), dtype=ENTRY)
     for name, values in columns.items():  # those that the runs share
         if len(values) == 1:
@@ -34,10 +36,10 @@ def make_entry_lists(seen: Tracks, claims: EntryClaims, drawn: Float, *, without
     for name, values in columns.items():
         if len(values) > 1:
             entries[name] = values[run, picked]
-    return ObjectLists(start, entries)
+    return ObjectLists(start, entries), picked
 
 
-def listed_rows(received: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
+def _list_rows(received: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
     """(S, F + 1) where each list begins, and (N,) the row of each entry, in the order of `drawn (S, P)`."""
     valid = received.valid if without_object_ix < 0 else received.valid & (received.row_object_ix != without_object_ix)
     order, bounds = received.by_frame

@@ -12,7 +12,7 @@ captures and full covariances, and these are taken from there.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -59,9 +59,10 @@ _LARGEST_ID = 2**63 - 1
 class _EntryRows:
     """Entries of all lists, in the order of the messages."""
 
-    captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next three
+    captured: list[int | None] = field(default_factory=list)  # in ns, None: not said; of every list, as the next four
     arrives: list[int | None] = field(default_factory=list)
     logged: list[int] = field(default_factory=list)
+    still: list[set[int]] = field(default_factory=list)  # ground truth ids of stationary objects
     ahead: list[int] = field(default_factory=list)  # of the clock of the stamps against that of log times
     undecoded: int = 0
     impossible: int = 0  # stamps that are none
@@ -73,6 +74,16 @@ class _EntryRows:
     variances: list[tuple[float, ...]] = field(default_factory=list)
     existence: list[float] = field(default_factory=list)  # NaN: not said
     likely: list[dict[int, float]] = field(default_factory=list)  # probability by class, as far as stated
+
+    def add_details(self, details: Mapping[int, Sequence[Any]]) -> None:
+        """Take the variances that a topic `…/detail` states, by the time in ns at which each list was available."""
+        first = np.searchsorted(self.frame, np.arange(len(self.arrives) + 1)).tolist()
+        for begin, end, stamp_ns, still in zip(first[:-1], first[1:], self.arrives, self.still, strict=True):
+            items = [item for item in details.get(stamp_ns or 0, ()) if isinstance(item, dict)]
+            items.sort(key=lambda item: osi_id(str(item.get("id"))) in still)  # stationary ones are last in messages
+            for p, item in zip(range(begin, end), items if len(items) == end - begin else (), strict=False):
+                stated = (item.get(name, of) for name, of in zip(UNCERTAINTIES, self.variances[p], strict=True))
+                self.variances[p] = tuple(of if isinstance(of, int | float) else np.nan for of in stated)
 
 
 @dataclass(frozen=True)
@@ -107,7 +118,7 @@ def read_sensor_data(path: Local, topic: str, scene: Scene) -> Tracks:
 
     Raises RecordingError when there is no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
-    return _make_tracks(*_read_rows(path, topic), topic, scene)
+    return _make_tracks(_read_rows(path, topic), topic, scene)
 
 
 @dataclass(frozen=True)
@@ -138,7 +149,7 @@ def read_recorded(path: Local, topic: str, scene: Scene, window: Window | None =
 
     Raises RecordingError: no such topic of osi3.SensorData, or a message of it cannot be decoded.
     """
-    rows, _ = _read_rows(path, topic, window)
+    rows = _read_rows(path, topic, window)
     findings: list[str] = [*find("undecoded", rows.undecoded)]
     findings += [line for rule, number in sorted(rows.rules.items()) for line in find(rule, number)]
     times = _settle_times(rows, findings)
@@ -203,8 +214,8 @@ def _make_recorded(
     )  # fmt: skip
 
 
-def _read_rows(path: Local, topic: str, window: Window | None = None) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
-    """Entries on `topic`, and details by the time in ns at which their list was available, then by object id."""
+def _read_rows(path: Local, topic: str, window: Window | None = None) -> _EntryRows:
+    """Entries on `topic`, with the variances that a topic `…/detail` beside it states."""
     return open_log(path).within(window).attempt(lambda log: _read_messages(log, topic))
 
 
@@ -220,7 +231,7 @@ def _no_lists_message(log: Log, topic: str) -> str:
     return f"{content}; lists of units are on {', '.join(sorted(list_topics))}"
 
 
-def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str, Any]]]:
+def _read_messages(log: Log, topic: str) -> _EntryRows:
     """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
     chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
     if not chosen:
@@ -228,12 +239,12 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
     beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
     rows, allowance = _EntryRows(), DecodeAllowance(log.file_bytes())
-    details: dict[int, dict[str, Any]] = {}
+    details: dict[int, list[Any]] = {}
     for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
         if number in beside:
             with suppress(ValueError, TypeError, KeyError):  # else not written by `copem-replay`
                 content = parse_json(payload)
-                details[content["available_ns"]] = {item["id"]: item for item in content["objects"]}
+                details[content["available_ns"]] = [*content["objects"]]
         else:
             try:
                 message_class = load_message_class(SENSOR_DATA)
@@ -249,7 +260,8 @@ def _read_messages(log: Log, topic: str) -> tuple[_EntryRows, dict[int, dict[str
             _add_message(rows, message, log_time_ns, chosen[number].ahead_ns)
     if rows.undecoded and not rows.logged:
         raise RecordingError(f"none of its {rows.undecoded} messages can be decoded", path=log.path, topic=topic)
-    return rows, details
+    rows.add_details(details)
+    return rows
 
 
 def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int) -> None:
@@ -257,6 +269,7 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
     frame = len(rows.logged)
     rows.logged.append(min(log_time_ns, LAST_NS))
     rows.ahead.append(ahead_ns)
+    rows.still.append({of.value for item in message.stationary_object for of in item.header.ground_truth_id})
     for name, times in (("timestamp", rows.arrives), ("last_measurement_time", rows.captured)):
         times.append(osi.osi_stamp_ns(getattr(message, name)) if message.HasField(name) else None)
         rows.impossible += message.HasField(name) and times[-1] is None
@@ -340,8 +353,8 @@ def _transform_entry(
     return float(x), float(y), float(z), float(wrap_angles(np.array(yaw))), float(vx), float(vy)
 
 
-def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: str, scene: Scene) -> Tracks:
-    """Tracks by object of `scene` and track id, with the full covariances of `details` where there are any."""
+def _make_tracks(rows: _EntryRows, topic: str, scene: Scene) -> Tracks:
+    """Tracks by object of `scene` and track id."""
     stamps = _settle_times(rows, []).stamps_ns
     by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     object_by_id = {osi_id(name): k for k, name in enumerate(scene.object_ids)}
@@ -353,10 +366,6 @@ def _make_tracks(rows: _EntryRows, details: dict[int, dict[str, Any]], topic: st
     first = np.flatnonzero(new)
     values = np.array(rows.values, dtype=float).reshape(-1, len(VALUES))[order]
     variances = np.array(rows.variances, dtype=float).reshape(-1, len(UNCERTAINTIES))[order]
-    for p, (k, f) in enumerate(zip(object_ix[order].tolist(), frame[order].tolist(), strict=True)):
-        item = details.get(int(stamps[by_time[f], 1]), {}).get(scene.object_ids[k]) if k >= 0 else None
-        if item is not None:
-            variances[p] = [np.nan if item[name] is None else item[name] for name in UNCERTAINTIES]
     start = np.append(first, len(order))
     return build_unit_tracks(
         topic, scene, stamps[by_time], start, object_ix[order][first], frame[order], values, variances

@@ -15,6 +15,7 @@ from pydantic_core import PydanticCustomError
 
 from copem_replay.core.components import Flag, Frozen, Id, NotNegative, Positive, Slot
 from copem_replay.core.errors import unknown_name_message
+from copem_replay.core.site_map import make_polygon
 from copem_replay.core.tracks import Bool, Float
 from copem_replay.metrics.braking.driver import DRIVERS, Driver
 from copem_replay.metrics.limits import OBJECTS
@@ -88,15 +89,21 @@ class OwnArea(Frozen):
             raise ValueError("expected `width_m` with `along_m`, and not with a polygon")
         return self
 
+    @property
+    def rings_m(self) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The rings of its polygon, as an area of a map has them."""
+        import shapely
+
+        if self.along_m is None or self.width_m is None:
+            return (self.polygon_m or (),)
+        strip = shapely.buffer(shapely.LineString(self.along_m), self.width_m / 2, cap_style="flat", join_style="mitre")
+        return tuple(tuple(ring.coords[:-1]) for ring in (strip.exterior, *strip.interiors))
+
     def covers(self, x_m: Float, y_m: Float) -> Bool:
         """Whether places (K,) are in it, or on its border."""
         import shapely
 
-        points = shapely.points(x_m, y_m)
-        if self.along_m is None or self.width_m is None:
-            return np.asarray(shapely.intersects(shapely.Polygon(self.polygon_m), points))
-        strip = shapely.buffer(shapely.LineString(self.along_m), self.width_m / 2, cap_style="flat", join_style="mitre")
-        return np.asarray(shapely.intersects(strip, points))
+        return np.asarray(shapely.intersects(make_polygon(self.rings_m), shapely.points(x_m, y_m)))
 
 
 class AnnotatedArea(Frozen):

@@ -227,5 +227,9 @@ class PerceptionSetup(Protocol):
         """The units with a PEM, by name."""
 
     @property
+    def areas(self) -> Mapping[str, Any]:
+        """Areas of the experiment by name, with their `rings_m`, beside those of the log's maps."""
+
+    @property
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Static obstacles beside those of the log."""

@@ -22,7 +22,7 @@ from copem_replay.core.tracks import CLASSES, Float, Int, Scene, Tracks, append_
 from copem_replay.core.view_geometry import ViewGeometry
 from copem_replay.perception.observation import Observations, compute_view
 from copem_replay.perception.pem.condition import find_couples
-from copem_replay.perception.pem.model import GhostModel, ObjectSidePlace, class_row, draw_classes
+from copem_replay.perception.pem.model import AreaPlace, GhostModel, ObjectSidePlace, class_row, draw_classes
 
 if TYPE_CHECKING:
     from copem_replay.perception.config import PerceptionSetup
@@ -104,6 +104,7 @@ def draw_ghosts(
         lists = _UnitLists(u, name, frames[asked], stamps, poses, np.flatnonzero(poses.present)[asked])
         for n, sort in enumerate(setup.pems[str(unit.pem)].ghosts):
             if sort.in_list > 0 and len(stamps):
+                sort = _find_areas(sort, scene, setup)
                 born = _draw_born(rng, scene, observations, lists, (n, sort), runs)
                 if len(born.ghost):
                     couples = setup.pems[str(unit.pem)].couples
@@ -113,6 +114,16 @@ def draw_ghosts(
                     rows = Observations(tracks, view, couple_ix, sure, sure)
                     pieces.append(GhostRows(rows, born.words[born.ghost], np.full(len(sure), n)))
     return _join_ghosts(pieces)
+
+
+def _find_areas(sort: GhostModel, scene: Scene, setup: PerceptionSetup) -> GhostModel:
+    """The same ghosts, with the polygons of the areas that they are in: the experiment's own, else those of maps."""
+    if not isinstance(sort.where, AreaPlace):
+        return sort
+    names = {*sort.where.areas}
+    polygons = [of.rings_m for name, of in setup.areas.items() if name in names]
+    polygons += [of.rings_m for of in scene.areas if {of.name, of.kind} & (names - setup.areas.keys())]
+    return sort.model_copy(update={"where": sort.where.over(polygons)})
 
 
 def make_ghost_draws(scene: Scene, ghosts: GhostRows, setup: PerceptionSetup, run: int) -> UnitDraws:

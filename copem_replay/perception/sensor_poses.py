@@ -13,7 +13,7 @@ from copem_replay.core.errors import count_noun
 from copem_replay.core.interpolation import interpolate_at_instants, wrap_angles
 from copem_replay.core.tracks import SAME_INSTANT_NS, Bool, Float, Int, Scene, Solid, Tracks, outline_solids
 from copem_replay.perception.config import Obstacle, PerceptionSetup, Placement
-from copem_replay.perception.pem.condition import Condition, Couple
+from copem_replay.perception.pem.condition import Couple
 from copem_replay.perception.visibility import NO_STATICS, Observers, Statics, make_statics
 
 FAR_GROUND_M = 50.0
@@ -303,27 +303,38 @@ def _note_objects_inside(scene: Scene, truth: Tracks, solids: Sequence[Solid]) -
 
 # Outlines of the couples of a PEM in the unit's own frame, for drawing.
 
-_ARC_STEP_RAD = np.deg2rad(3)
-"""A chord of this angle is 3 cm off the arc at 80 m."""
+_ARC_STEP_RAD, _COARSE_STEP_RAD = np.deg2rad(3), np.deg2rad(9)
+"""Chords of these angles are 3 and 25 cm off the arc at 80 m."""
 
 
 def couple_outlines(pem: Sequence[Couple]) -> list[Float]:
     """Borders (K, 2) of the fields in which couples of a PEM apply, m, ahead along x; none for an unbounded field."""
-    fields = dict.fromkeys((c.when.range_m, c.when.azimuth_deg) for c in pem)
+    return [border for borders in _field_borders(pem) for border in borders]
+
+
+def couple_polygons(pem: Sequence[Couple]) -> list[Float]:
+    """These fields as coarse polygons (K, 2), counter-clockwise, the first corner once; a ring is cut open behind."""
     return [
-        border for field in fields for border in _condition_outline(Condition(range_m=field[0], azimuth_deg=field[1]))
+        borders[0][:-1] if len(borders) == 1 else np.concatenate([borders[1], borders[0][::-1]])
+        for borders in _field_borders(pem, _COARSE_STEP_RAD)
     ]
 
 
-def _condition_outline(when: Condition) -> list[Float]:
-    """Borders (K, 2) of the field of a condition: two circles, or one closed outline."""
-    if when.range_m is None:
-        return []
-    near_m, far_m = when.range_m
-    first, last = np.deg2rad(when.azimuth_deg or (-180.0, 180.0))
+def _field_borders(pem: Sequence[Couple], step_rad: float = _ARC_STEP_RAD) -> list[list[Float]]:
+    """The borders of each field: one, or of a ring the inner and the outer one."""
+    fields = dict.fromkeys((c.when.range_m, c.when.azimuth_deg) for c in pem)
+    return [_field_outline(range_m, azimuth, step_rad) for range_m, azimuth in fields if range_m is not None]
+
+
+def _field_outline(
+    range_m: tuple[float, float], azimuth_deg: tuple[float, float] | None, step_rad: float
+) -> list[Float]:
+    """Borders (K, 2) of a field: two circles, or one closed outline."""
+    near_m, far_m = range_m
+    first, last = np.deg2rad(azimuth_deg or (-180.0, 180.0))
     all_around = last - first >= 2 * np.pi - 1e-9
     span = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
-    angle = first + np.linspace(0, span, int(np.ceil(span / _ARC_STEP_RAD - 1e-9)) + 1)
+    angle = first + np.linspace(0, span, int(np.ceil(span / step_rad - 1e-9)) + 1)
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if all_around:
         return [radius_m * arc for radius_m in (near_m, far_m) if radius_m > 0]

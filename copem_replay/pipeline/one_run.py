@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from copem_replay.core.errors import ExperimentError, count_noun
 from copem_replay.core.fused_tracks import FusedTracks
+from copem_replay.core.object_list import Entries
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Bool, Float, Int, TimeChunk, Tracks
 from copem_replay.experiment.schema import Experiment
+from copem_replay.fusion.interface import ListFusion
+from copem_replay.io.encodings.column_bytes import expand_ranges
 from copem_replay.io.recording import Recording
+from copem_replay.io.write.detail import ReadyLists
 from copem_replay.metrics.onset import select_counted
 from copem_replay.perception.observation import Observations
-from copem_replay.perception.sensor_poses import find_carrier
+from copem_replay.perception.sensor_poses import couple_polygons, find_carrier
 from copem_replay.pipeline.chain import fuse_members
 from copem_replay.pipeline.expansion import RunGroup, group_runs, resolve_for_run
 from copem_replay.pipeline.prepare import ROWS_HELD, Replay, observation_rows, prepare_log
-from copem_replay.pipeline.receiver import Receivers
+from copem_replay.pipeline.receiver import (
+    Receivers,
+    StatedCaptures,
+    make_entry_tracks,
+    remove_truth_ids,
+    state_captures,
+)
 from copem_replay.pipeline.scoring import match_run
-from copem_replay.pipeline.world import Transmission
+from copem_replay.pipeline.world import Transmission, WorldChunk
 
 if TYPE_CHECKING:
     from copem_replay.pipeline.run import StudyTables
@@ -41,6 +51,11 @@ class RunTracks:
     run: int
 
     def __iter__(self) -> Iterator[dict[str, FusedTracks]]:
+        for chunk in self.chunks():
+            yield chunk.fused
+
+    def chunks(self) -> Iterator[RunChunk]:
+        """The fused tracks, and the lists of the units that they are made of."""
         if len(self.replay.chunks) == 1:
             yield self._all
         else:
@@ -50,24 +65,26 @@ class RunTracks:
         """The tracks of the whole log. Raises ExperimentError where the log is too long for that."""
         replay = self.replay
         if len(replay.chunks) == 1:
-            return self._all
+            return self._all.fused
         if observation_rows(replay.scene, replay.truth, replay.expanded) > ROWS_HELD:
             raise ExperimentError(f"{replay.scene.log}: too long to be held at once; take a window of it")
         return replace(self, replay=replace(replay, chunks=(TimeChunk(),))).whole()
 
     @cached_property
-    def _all(self) -> dict[str, FusedTracks]:
+    def _all(self) -> RunChunk:
         return next(self._compute())
 
-    def _compute(self) -> Iterator[dict[str, FusedTracks]]:
+    def _compute(self) -> Iterator[RunChunk]:
         replay, measure = self.replay, self.experiment.measure
         units = replay.expand(self.experiment)
         [group] = group_runs(units, replay.scene.log, np.array([self.run]))
-        receivers = Receivers(Transmission(fuse_members(replay, units, group), units, group))
+        lists = Transmission(fuse_members(replay, units, group), units, group)
+        receivers = Receivers(lists)
         for world in receivers.worlds():
-            truth_cache, result = replay.truth_cache_of(world.chunk), {}
+            truth_cache, result, arriving = replay.truth_cache_of(world.chunk), {}, dict[str, Tracks]()
             for name in units.configurations:
                 output = receivers.fuse(world, name)
+                arriving[name] = lists.arriving(name)
                 matches = match_run(truth_cache, output, measure) if output.fused_tracks is None else None
                 [(_, fused_tracks)] = output.tracks_by_run(matches)
                 if output.faults is not None:
@@ -75,7 +92,80 @@ class RunTracks:
                 if linked := units.linked(name):
                     fused_tracks = replace(fused_tracks, by_link=_is_sent_by_link(output.sent, linked, group))
                 result[name] = fused_tracks
-            yield result
+            yield RunChunk(result, partial(collect_unit_lists, world, lists, arriving))
+
+
+class RunChunk(NamedTuple):
+    """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
+
+    fused: dict[str, FusedTracks]
+    unit_lists: Callable[[], list[ReadyLists]]
+
+
+def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[ReadyLists]:
+    """What units that are not recorded have ready to send in a time chunk of one run, as fusions get it.
+
+    `arriving`: by configuration the lists by when they reach its receiver.
+    """
+    chunk, experiment, every = world.chunk, world.experiment, sent.lists
+    ready_s = every.common_arrives_s
+    ready = np.isfinite(ready_s) & (ready_s >= chunk.from_s) & (ready_s < chunk.until_s)
+    earliest_s = float(every.captured_s[ready].min(initial=np.inf)) - SAME_INSTANT_S
+    if earliest_s < world.earliest_s:
+        world = sent.world(chunk, earliest_s)
+    if experiment.draws_claims and not experiment.runs_apart:
+        world = replace(world, claiming=True, _listed={}, _sent={})
+    entries, _, rows = remove_truth_ids(world)
+    stated = state_captures(world.scene, every, experiment, int(world.group.runs[0]))
+    result = []
+    for name, sends in zip(every.units, world.group.sending, strict=True):
+        if name not in experiment.recorded and sends:
+            frames = np.flatnonzero(ready & (every.frame_unit_ix == every.units.index(name)))
+            frames = frames[np.argsort(ready_s[frames], kind="stable")]
+            start, places = expand_ranges(entries.start[0], frames)
+            lists = _make_unit_tracks(world, name, frames, start, entries.entries[places], rows[places], stated)
+            heard = (c for c, of in experiment.configurations.items() if name in experiment.units_of(of))
+            arrives_s = {c: arriving[c].common_arrives_s[frames] for c in heard}
+            fields, posed = _find_fields(world, name, every.stamp_ns[frames])
+            true_ns = None if stated is None else every.stamp_ns[frames]
+            has_ids = _states_ids(experiment, name)
+            result.append(ReadyLists(name, lists, true_ns, arrives_s, fields, posed, has_ids))
+    return result
+
+
+def _states_ids(experiment: Experiment, name: str) -> bool:
+    """Whether the entries of a unit have track ids: those of its PEM, or of its fusion."""
+    unit = experiment.units[name]
+    if unit.pem is not None:
+        return experiment.pems[unit.pem].tracks is not None
+    return isinstance(unit.fusion, ListFusion) and unit.fusion.remembers
+
+
+def _find_fields(world: WorldChunk, name: str, stamp_ns: Int) -> tuple[list[Float], Float]:
+    """Polygons of the field of view of a unit, and its poses (4, F) at captures; of one that fuses there are none."""
+    pem = world.experiment.units[name].pem
+    if pem is None:
+        return [], np.empty((4, len(stamp_ns)))
+    poses = world.log.placed.poses[name]
+    at = np.searchsorted(world.log.placed.stamps_ns[name], stamp_ns)
+    posed = np.stack([poses.x_m, poses.y_m, poses.ground_m, poses.heading_rad])[:, at]
+    return couple_polygons(world.experiment.pems[pem].couples), posed
+
+
+def _make_unit_tracks(
+    world: WorldChunk, name: str, frames: Int, start: Int, entries: Entries, rows: Int, stated: StatedCaptures | None
+) -> FusedTracks:
+    """The entries (P,) of some lists of a unit as tracks, each one of its own; `rows (P,)`: of what units send."""
+    seen, frame_ix, said = world.sent("sampled"), np.repeat(np.arange(len(frames)), np.diff(start)), entries.copy()
+    captured_s = (seen.captured_s if stated is None else stated.stated_s)[frames]
+    age_s = 0.0 if seen.entry_age_s is None else seen.entry_age_s[0, rows]
+    said["unit_ix"], said["captured_s"] = 0, captured_s[frame_ix] - age_s
+    stamps = world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64), captured_s, seen.common_arrives_s[frames]
+    tracks = make_entry_tracks(name, said, np.arange(len(rows) + 1), seen.row_object_ix[rows], frame_ix, stamps)
+    more: dict[str, Any] = {of: getattr(seen, of) for of in ("yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")}
+    more = {of: None if column is None else column[:, rows] for of, column in more.items()}
+    none = np.zeros(len(rows) + 1, dtype=np.int64)
+    return FusedTracks(replace(tracks, **more), tracks, none[:0], none, said=said)
 
 
 def _is_sent_by_link(sent: Tracks, linked: list[str], group: RunGroup) -> Bool:

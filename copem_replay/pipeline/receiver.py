@@ -19,7 +19,7 @@ from copem_replay.communication.arrivals import FusionSchedule, SentEntries, fus
 from copem_replay.core.compiled import borrowing_kernel
 from copem_replay.core.fused_tracks import EntrySources, FusedTracks, find_newest_and_first
 from copem_replay.core.interpolation import AROUND_S
-from copem_replay.core.object_list import COVARIANCES, ENTRY, ObjectLists, TellsOf
+from copem_replay.core.object_list import COVARIANCES, ENTRY, Entries, ObjectLists, TellsOf
 from copem_replay.core.random import CounterRng, RandomKey
 from copem_replay.core.tracks import (
     NO_CAPTURE_NS,
@@ -43,7 +43,7 @@ from copem_replay.fusion.ideal import (
     keep_by_object,
 )
 from copem_replay.fusion.ideal_memory import remember_states
-from copem_replay.fusion.inputs import add_kept_entries, listed_rows, make_entry_lists, make_inputs
+from copem_replay.fusion.inputs import add_kept_entries, make_entry_lists, make_inputs
 from copem_replay.fusion.interface import (
     IdealFusion,
     ListFusion,
@@ -180,23 +180,25 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     start = np.append(np.flatnonzero(new), len(order))
     stamps = np.where(newest >= 0, received.stamp_ns[newest], NO_CAPTURE_NS).max(axis=1, initial=NO_CAPTURE_NS)
     captured = np.where(newest >= 0, received.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
-    fused = Tracks(
-        units=("fused",),
-        start=start,
-        unit_ix=np.zeros(len(start) - 1, dtype=np.int64),
-        object_ix=object_ix[order][start[:-1]],
-        frame_ix=frame[order],
-        stamp_ns=stamps,
-        captured_s=captured,
-        frame_unit_ix=np.zeros(len(issue_s), dtype=np.int64),
-        arrives_s=issue_s[None],
-        valid=np.ones((1, len(order)), dtype=bool),
-        **{name: entries[name][order][None] for name in (*VALUES, *COVARIANCES)},
-    )
+    captures = stamps, captured, issue_s
+    fused = make_entry_tracks("fused", entries[order], start, object_ix[order][start[:-1]], frame[order], captures)
     none = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
     second_of = np.where(matches.role[first:last] == DUPLICATE, matches.object_ix[first:last], -1)[order]
     return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s, second_of=second_of)
+
+
+def make_entry_tracks(
+    unit: str, entries: Entries, start: Int, object_ix: Int, frame_ix: Int, times: tuple[Int, Float, Float]
+) -> Tracks:
+    """Entries (P,) as tracks (E,) of one run; `times`: captures of lists (F,) in ns and in s, and arrivals in s."""
+    return Tracks(
+        units=(unit,), start=start, unit_ix=np.zeros(len(object_ix), dtype=np.int64), object_ix=object_ix,
+        frame_ix=frame_ix, stamp_ns=times[0], captured_s=times[1],
+        frame_unit_ix=np.zeros(len(times[0]), dtype=np.int64), arrives_s=times[2][None],
+        valid=np.ones((1, len(frame_ix)), dtype=bool),
+        **{name: entries[name][None] for name in (*VALUES, *COVARIANCES)},
+    )  # fmt: skip
 
 
 # Stated captures: when lists were captured, as fusions are told of it.
@@ -441,7 +443,7 @@ class Receivers:
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        lists, same = remove_truth_ids(world)
+        lists, same, _ = remove_truth_ids(world)
         stated, captured_s = self._state_captures(received), None
         if stated is not None:
             lists, captured_s = stated.as_told(lists), stated.stated_s
@@ -563,19 +565,19 @@ class Reach:
         return earliest_s
 
 
-def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int]:
+def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int, Int]:
     """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
+    Third, (N,): the row of each entry.
     """
     experiment, seen = world.experiment, world.sent("sampled")
     rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
     words, (claims, same) = world.words, world.claims
     random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
     drawn = rng.uniform("order in the list", random_key, world.group.runs)
-    lists = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
+    lists, picked = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, np.empty(0, dtype=np.int64)
-    picked = listed_rows(seen, drawn, without_object_ix=ego)[1]
+        return lists, np.empty(0, dtype=np.int64), picked
     pairs = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
-    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel()
+    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), picked

@@ -53,7 +53,8 @@ class WorldChunk:
 
     `observations`: rows of the modelled units. Includes earlier captures that the chunk needs, back to `earliest_s`.
     `complete`: with the rows of all objects and with ghosts, else only of objects with an episode. `sending`: what
-    units send of their lists, set once it is known; None: all. What is drawn is kept for all configurations.
+    units send of their lists, set once it is known; None: all. `claiming`: ghosts and claims are drawn also where no
+    fusion needs them, in one run. What is drawn is kept for all configurations.
     """
 
     log: Replay
@@ -64,6 +65,7 @@ class WorldChunk:
     earliest_s: float = -np.inf
     complete: bool = True
     sending: SentObjects | None = None
+    claiming: bool = False
     _listed: dict[States, Tracks] = field(default_factory=dict)
     _sent: dict[States, Tracks] = field(default_factory=dict)
 
@@ -86,7 +88,7 @@ class WorldChunk:
     @cached_property
     def ghosts(self) -> GhostRows | None:
         """Ghosts of the units, where the group has one run and there is a fusion without truth ids."""
-        if not self.complete or not self.experiment.runs_apart:
+        if not self.complete or not (self.claiming or self.experiment.runs_apart):
             return None
         between_s, run = (self.earliest_s, self.chunk.until_s), int(self.group.runs[0])
         return draw_ghosts(self.scene, self.observations, self.experiment, self.log.placed, run, between_s)
@@ -147,7 +149,7 @@ class WorldChunk:
         observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
         existence, class_ix = observations.existence, observations.view.class_ix
         claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
-        if experiment.runs_apart and experiment.draws_claims:  # else no receiver needs it
+        if (self.claiming or experiment.runs_apart) and experiment.draws_claims:  # else no receiver needs it
             drawn = make_draws(self.scene, observations, experiment, self.group.runs)
             claims = draw_claims(observations, experiment, drawn)
         if ghosts is not None:

@@ -120,9 +120,11 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
         if has_digest and stamps != recording.stamps and sha256_of(here) != recording.sha256:
             raise RecordingError("it is no longer what was replayed", path=first_recording(recording.place))
         truth = draw_truth(run.replayed, table) if show is None or show.truth else None
+        units = show is None or show.units
+        chunks = ((of.fused, of.unit_lists() if units else ()) for of in run.replayed.run_tracks.chunks())
         truths = {name for name, of in run.every.items() if of.units == TRUTH}
         notes = write_mcap(
-            path, here, run.replayed.replay.scene, run.replayed.run_tracks, table, run.manifest,
+            path, here, run.replayed.replay.scene, chunks, table, run.manifest,
             find_family(recording), recording.window, truth,
             colours=configuration_colours(run.every, truths, shown=run.replayed.experiment.configurations),
         )  # fmt: skip

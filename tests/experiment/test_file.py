@@ -636,6 +636,10 @@ CASES = [
     (SHOW, "{configurations: GT}", ".configurations: expected a list, found 'GT'"),
     (SHOW, "{configurations: []}", ".configurations: expected at least 1 in the list, found []"),
     (SHOW, "{configuration: [GT]}", ".configuration: unknown key; did you mean configurations?"),
+    (SHOW, "{units: some}", ".units: expected true or false, found 'some'"),
+    (SHOW, "{units: [ego]}", ".units: expected true or false, found ['ego']"),
+    (SHOW, "{truth: maybe}", ".truth: expected true or false, found 'maybe'"),
+    (SHOW, "{map: 1}", ".map: expected true or false, found 1"),
     (SHOW, "{run: -1}", ".run: expected at least 0, or 'median', 'worst' or 'best', or a list, found -1"),
 ]  # fmt: skip
 

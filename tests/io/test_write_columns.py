@@ -22,7 +22,7 @@ from copem_replay.io.encodings.cdr_bytes import encode_cdr
 from copem_replay.io.encodings.column_bytes import encode_messages
 from copem_replay.io.write.detail import DetailWriter, Statuses, StatusWriter
 from copem_replay.io.write.osi import SensorDataWriter
-from copem_replay.io.write.ros2 import DetectedObjectsWriter
+from copem_replay.io.write.ros2 import ObjectsWriter
 from copem_replay.io.write.scene import BoxWriter, Draw, UncertaintyWriter, draw_scenes, principal_axes
 from tests.oracles import messages as plain
 
@@ -142,7 +142,7 @@ def test_entries_about_no_object_move_in_messages_of_ros() -> None:
         fused_tracks, fused=replace(fused_tracks.fused, object_ix=np.full_like(fused_tracks.fused.object_ix, -1))
     )
     still, moves = (replace(SCENE, moving=np.append(SCENE.moving[:-1], last)) for last in (False, True))
-    of_both = [DetectedObjectsWriter(scene, fused_tracks, "map") for scene in (still, moves)]
+    of_both = [ObjectsWriter(scene, fused_tracks, "map") for scene in (still, moves)]
     messages = [list(writer.messages(np.full(4, 10**9))) for writer in of_both]
     assert max(map(len, messages[0])) > 500
     assert messages[0] == messages[1]

@@ -73,7 +73,8 @@ class Written:
     def write(self, path: Path, source: Path = SOURCE) -> list[str]:
         manifest = {"experiment": "version: 1", "run": str(RUN)}
         colours = configuration_colours(self.run_tracks, ())
-        return write_mcap(path, source, self.replay.scene, [self.run_tracks], self.table, manifest, colours=colours)
+        tracks, scene = [(self.run_tracks, ())], self.replay.scene
+        return write_mcap(path, source, scene, tracks, self.table, manifest, colours=colours)
 
 
 @pytest.fixture(scope="module")
@@ -342,7 +343,7 @@ def test_a_recording_of_osi_is_written_as_ever(written: Written, tmp_path: Path)
     family = find_family(written.recording)
     manifest = {"experiment": "version: 1", "run": str(RUN)}
     path = tmp_path / "out.mcap"
-    tracks, colours = [written.run_tracks], configuration_colours(written.run_tracks, ())
+    tracks, colours = [(written.run_tracks, ())], configuration_colours(written.run_tracks, ())
     write_mcap(path, SOURCE, written.replay.scene, tracks, written.table, manifest, family, colours=colours)
     assert path.read_bytes() == written.path.read_bytes()
     with path.open("rb") as file:

@@ -194,7 +194,7 @@ class Written:
             path,
             source or self.source,
             self.replay.scene,
-            [self.run_tracks],
+            [(self.run_tracks, ())],
             self.table,
             {"run": "0"},
             find_family(self.recording),
@@ -393,7 +393,7 @@ def test_names_of_any_length_do_not_shift_what_follows(written: Written, tmp_pat
     recording = read_log(source, name="drive", ego=written.experiment.ego)
     target = tmp_path / "out.mcap"
     family, colours = find_family(recording), configuration_colours(written.run_tracks, ())
-    tracks = [written.run_tracks]
+    tracks = [(written.run_tracks, ())]
     write_mcap(target, source, written.replay.scene, tracks, written.table, {}, family, colours=colours)
     lists = [m for _, _, m in decoded(target) if hasattr(m, "header")]
     assert {m.header.frame_id for m in lists} == {frame_id.lstrip("/") or "map"}

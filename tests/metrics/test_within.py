@@ -102,6 +102,17 @@ class TestAreas:
         assert problems[key] == "no area is named 'sqare'; did you mean square?"
         assert ("measure", "objects", "within", "areas", 0) not in problems
 
+    def test_so_is_one_that_ghosts_are_in(self) -> None:
+        ghosts = [{"in_list": 1, "where": {"kind": "area", "areas": ["kerb", "sqare"]}}]
+        plain = experiment(areas=self.OWN)
+        [name] = {str(unit.pem) for unit in plain.modelled.values()}
+        couples = plain.pems[name].model_dump(mode="json")
+        wanted = experiment(areas=self.OWN, pems={name: {"couples": couples, "ghosts": ghosts}})
+        problems = dict(check_against_log(wanted, passing()))
+        assert problems[("pems", name, "ghosts", 0, "where", "areas", 1)] == (
+            "no area is named 'sqare'; did you mean square?"
+        )
+
     def test_lanes_by_id_and_by_kind(self) -> None:
         """A border counts; a lane that is driven both ways is one."""
         log = passing()

@@ -61,7 +61,7 @@ def sensor_data(
     data.mounting_position.orientation.SetInParent()
     for p in rows_of(fused_tracks, frame):
         number = int(fused.row_object_ix[p])
-        moving = number < 0 or bool(scene.moving[number])
+        moving = said is not None or number < 0 or bool(scene.moving[number])
         item = (data.moving_object if moving else data.stationary_object).add()
         if said is None:
             item.header.tracking_id.value = osi_id(scene.object_ids[number])

@@ -17,6 +17,7 @@ from copem_replay.io.recording import Recording
 from copem_replay.perception.config import ClockError, Outages, PoseError
 from copem_replay.perception.pem.condition import ExistenceScores
 from copem_replay.perception.pem.model import (
+    AreaPlace,
     FieldPlace,
     GhostModel,
     GivenPlaces,
@@ -257,6 +258,7 @@ def test_the_guide_holds(tmp_path: Path) -> None:
         GhostModel,
         FieldPlace,
         GivenPlaces,
+        AreaPlace,
         ObjectSidePlace,
         ListedClasses,
         ExistenceScores,

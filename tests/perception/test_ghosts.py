@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 from scipy import stats
 
+from copem_replay.core.site_map import make_area
 from copem_replay.core.tracks import CLASSES, Float
 from copem_replay.experiment.schema import Experiment
 from copem_replay.experiment.validate import find_problems
@@ -146,6 +149,42 @@ class TestPlaces:
         assert east.mean() == pytest.approx(0.5, abs=0.04)
         assert stats.kstest((x_m[east] - 12) / 0.5, "norm").pvalue > 1e-3
         assert stats.kstest((y_m[~east] - 7) / 0.5, "norm").pvalue > 1e-3
+
+    def test_areas_of_the_world(self) -> None:
+        """Uniform over their union: an own triangle, a strip, and crosswalks of a map, of which one has a hole."""
+        square = np.array([[20.0, 0], [30, 0], [30, 10], [20, 10]])
+        walks = (
+            make_area("crosswalk 7", "crosswalk", square, square / 2 + [12.5, 2.5]),
+            make_area("own", "crosswalk", square + 500),  # an own area has this name
+            make_area("lot", "parking", square + 200),
+        )
+        plan = plan_of(
+            {"in_list": 4, "where": {"kind": "area", "areas": ["own", "strip", "crosswalk"]}},
+            areas={
+                "own": {"polygon_m": [[0, 0], [12, 0], [0, 20]]},
+                "strip": {"along_m": [[-20, 5], [6, 5]], "width_m": 4},
+                "other": {"polygon_m": [[90, 0], [99, 0], [90, 9]]},
+            },
+        )
+        recording = scene_of(until_s=30)
+        recording = replace(recording, scene=replace(recording.scene, areas=walks))
+        made = found(plan, recording, 4)
+        x_m, y_m = (np.concatenate([getattr(rows.observations.tracks, n)[0] for rows in made]) for n in ("x_m", "y_m"))
+        own, strip = shapely.Polygon([(0, 0), (12, 0), (0, 20)]), shapely.box(-20, 3, 6, 7)
+        ring = shapely.Polygon(square, [square / 2 + [12.5, 2.5]])
+        parts = [
+            own & strip,
+            own - strip,
+            strip - own,
+            ring & shapely.box(20, 0, 30, 5),
+            ring - shapely.box(20, 0, 30, 5),
+        ]
+        apart = shapely.box(500, 500, 540, 540)  # "crosswalk" is also the kind of that area
+        parts = [part.buffer(1e-9) for part in (*parts, apart & shapely.box(520, 500, 530, 510))]
+        counted = [int(shapely.contains_xy(part, x_m, y_m).sum()) for part in parts]
+        assert sum(counted) == len(x_m) > 4000
+        sizes = np.array([part.area for part in parts])
+        assert stats.chisquare(counted, len(x_m) * sizes / sizes.sum()).pvalue > 1e-3
 
     def test_beside_objects_that_the_unit_could_list(self) -> None:
         """A truck drives away and is seen up to 60 m; another class and one too far have none beside them."""

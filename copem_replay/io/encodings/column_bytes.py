@@ -334,7 +334,7 @@ class StatedRows:
     """A value in the rows `said` (N,) only, `values` of these rows alone; the others have null, or nothing."""
 
     said: Bool
-    values: NDArray[Any]
+    values: NDArray[Any] | RowTexts
     null: bool = True
 
 

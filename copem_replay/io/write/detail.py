@@ -8,6 +8,8 @@ is there where a fusion was told of clocks that are off. Objects are in the orde
 or outages, `ghosts` are the entries about no object in the lists that came in with this one, and `down` the units whose
 last list was not made.
 
+Beside the lists of a unit, `copem/units/<name>/objects`, it has what their messages leave out (`ReadyLists`).
+
 `status` has the status of each measured object at each list, for State Transitions panels. An object is known as the
 detections table has it: from `detection_s` on, while the newest list holds it.
 """
@@ -15,6 +17,8 @@ detections table has it: from `detection_s` on, while the newest list holds it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +43,7 @@ from copem_replay.io.encodings.column_bytes import (
     encode_json,
     expand_ranges,
     split_into_blocks,
+    start_offsets,
 )
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA
 
@@ -173,8 +178,10 @@ Event = Mapping[str, Any]
 DETAIL_JSON = _describe_messages(
     DETAIL_SCHEMA,
     captured_ns={"type": ["integer", "null"]},
+    true_captured_ns=_INTEGER,
+    arrives_ns={"type": "object", "additionalProperties": {"type": ["integer", "null"]}},
     objects=_list_of(
-        id=_TEXT,
+        id={"type": ["string", "null"]},
         existence={"type": "number"},
         **dict.fromkeys(UNCERTAINTIES, _NUMBER),
         newest_captured_ns={"type": ["integer", "null"]},
@@ -186,6 +193,12 @@ DETAIL_JSON = _describe_messages(
     ),
     events={"type": "array", "items": {"type": "object"}},
 )
+
+
+def _state_instants(t0_ns: int, time_s: Float) -> StatedRows:
+    """Instants of the log as stamps, null where they are not finite: there is none."""
+    known = np.isfinite(time_s)
+    return StatedRows(known, t0_ns + np.rint(time_s[known] * 1e9).astype(np.int64))
 
 
 def _stated_captures(captured_ns: Int) -> StatedRows:
@@ -238,16 +251,10 @@ class DetailWriter:
             **({} if claims is None else {"existence": claims["existence"][rows]}),
             **(sides if sized.any() else {}),
             **{name: None if variance is None else variance[0, rows] for name, variance in spread.items()},
-            "newest_captured_ns": _stated_captures(self._stamps(self._fused_tracks.captured_s[0, rows])),
-            **({} if stated_s is None else {"stated_captured_ns": self._stamps(stated_s[rows])}),
+            "newest_captured_ns": _state_instants(self._t0_ns, self._fused_tracks.captured_s[0, rows]),
+            **({} if stated_s is None else {"stated_captured_ns": _state_instants(self._t0_ns, stated_s[rows])}),
             **self._entries(rows),
         }
-
-    def _stamps(self, captured_s: Float) -> Int:
-        """Instants of the log as stamps; −∞ is no capture."""
-        known = np.isfinite(captured_s)
-        since_ns = np.rint(np.where(known, captured_s, 0.0) * 1e9).astype(np.int64)
-        return np.where(known, self._t0_ns + since_ns, NO_CAPTURE_NS)
 
     def _entries(self, rows: Int) -> JsonContent:
         """The entries that the objects of some rows were made of."""
@@ -265,3 +272,72 @@ class DetailWriter:
         """The end of a message: detections with its list, and faults of the units' lists."""
         content = {"events": list(self._events.get(frame, ())), **(self._faults[frame] if self._faults else {})}
         return b"," + orjson.dumps(content)[1:]
+
+
+# Lists of units.
+
+
+@dataclass(frozen=True)
+class ReadyLists:
+    """The lists (F,) of one unit in one run, in the order in which it has them ready, entry by entry in `lists.fused`.
+
+    Without the entry about the ego, which no receiver here takes in. `lists.fused.stamp_ns`: captures as the unit
+    states them; `true_captured_ns`: as they are, None: the same. `arrives_s`: when each reaches the receiver of a
+    configuration, inf: never. `fields`: polygons (K, 2) of its field of view, ahead along x; `poses (4, F)`:
+    east, north, ground and heading at the captures. `has_ids`: whether entries have track ids.
+    """
+
+    name: str
+    lists: FusedTracks
+    true_captured_ns: Int | None
+    arrives_s: Mapping[str, Float]
+    fields: Sequence[Float]
+    poses: Float
+    has_ids: bool
+
+    def draw_areas(self, first: int, last: int) -> RepeatedMessages:
+        """The field of view in the world at some lists, as polygons of osi3.SensorData.VirtualDetectionArea.
+
+        Places are rounded to 1/64 m: the other digits are most of what compression leaves of a field that moves.
+        """
+        x, y, z, heading = self.poses[:, first:last, None]
+        ahead, left = np.concatenate(self.fields).T
+        cos, sin = np.cos(heading), np.sin(heading)
+        places = x + cos * ahead - sin * left, y + sin * ahead + cos * left, z + 0 * ahead
+        corners = {axis: np.rint(64 * place.ravel()) / 64 for axis, place in zip("xyz", places, strict=True)}
+        sizes = np.tile([len(border) for border in self.fields], last - first)
+        polygons = {"vertex": RepeatedMessages(start_offsets(sizes), corners)}
+        return RepeatedMessages(np.arange(last - first + 1) * len(self.fields), polygons)
+
+
+class UnitDetailWriter:
+    """Turns the lists of a unit into messages. `beside (P,)`: what its entries have no fields for, left out where 0.
+
+    The `id` of an entry is that of the true object it is about, null: of none.
+    """
+
+    def __init__(self, scene: Scene, unit: ReadyLists, beside: Mapping[str, Float]) -> None:
+        self._names, self._unit, self._beside = TextPool.of(scene.object_ids), unit, beside
+        self._stamp = partial(_state_instants, scene.t0_ns)
+
+    def messages(self, available_ns: Int) -> Iterator[bytes]:
+        """The lists as they were ready at these instants of the log's clock, (F,)."""
+        unit, fused = self._unit, self._unit.lists.fused
+        bounds, true_ns = fused.by_frame[1], unit.true_captured_ns
+        for first, last in split_into_blocks(bounds):
+            rows, lists = slice(bounds[first], bounds[last]), slice(first, last)
+            known = fused.row_object_ix[rows] >= 0
+            names = self._names.at(fused.row_object_ix[rows][known])
+            beside = {name: of[rows] for name, of in self._beside.items()}
+            objects = {
+                "id": StatedRows(known, names),
+                **{name: StatedRows(of != 0, of[of != 0], null=False) for name, of in beside.items()},
+            }
+            content: JsonContent = {
+                "available_ns": available_ns[lists],
+                "captured_ns": fused.stamp_ns[lists],
+                **({} if true_ns is None else {"true_captured_ns": true_ns[lists]}),
+                "arrives_ns": {name: self._stamp(of[lists]) for name, of in unit.arrives_s.items()},
+                "objects": RepeatedMessages(bounds[first : last + 1] - bounds[first], objects),
+            }
+            yield from encode_json(content, last - first)

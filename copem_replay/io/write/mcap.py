@@ -6,6 +6,9 @@ lists as boxes) and `…/detail` (JSON: what the objects have no fields for), in
 for viewers: `…/status` (what is known) and `…/uncertainty` (ellipses, paler with age). The truth is a scene of its own:
 `copem/truth/scene` (moving objects), `…/static` (all else) and `…/transform` (the ego's frame of reference).
 
+For each unit with a PEM there are two: `copem/units/<name>/objects` (its lists) and `…/detail`, one message per list,
+log_time = publish_time = the instant the unit had it ready.
+
 A given input gives the same bytes each time; the file appears under its name when it is complete, or not at all.
 """
 
@@ -37,7 +40,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import SAME_INSTANT_S, TRUTH, Int, Scene, Tracks
 from copem_replay.io.open import Local
 from copem_replay.io.window import Window
-from copem_replay.io.write.detail import Event, Statuses
+from copem_replay.io.write.detail import Event, ReadyLists, Statuses
 from copem_replay.io.write.message_family import (
     OSI,
     RUN_RECORD,
@@ -48,6 +51,7 @@ from copem_replay.io.write.message_family import (
     TruthWriter,
     list_extra_topics,
     list_topics,
+    list_unit_topics,
 )
 from copem_replay.io.write.osi import OSI_VERSION
 from copem_replay.io.write.scene import MovingEntities, TruthScene, draw_moving, transform_content
@@ -63,13 +67,15 @@ _EVENT_TIMES = ("onset_s", "captured_s", "time_to_detection_s", "distance_at_det
 """Columns of the detections table that the event of a detection tells of."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
+RunLists = tuple[Mapping[str, FusedTracks], Sequence[ReadyLists]]
+"""The fused tracks of one run by configuration, and the lists of its units."""
 
 
 def write_mcap(
     path: Path,
     source: Local,
     scene: Scene,
-    run_tracks: Iterable[Mapping[str, FusedTracks]],
+    run_chunks: Iterable[RunLists],
     table: pd.DataFrame,
     manifest: Mapping[str, str],
     family: Family | None = None,
@@ -80,10 +86,11 @@ def write_mcap(
 ) -> list[str]:
     """Write `source` with the fused lists of one run added.
 
-    `run_tracks`: time chunk by time chunk, the fused tracks by configuration; values (1, P). `table`: the rows of the
-    detections table of this log and run. `manifest`: what made the file, kept as a metadata record. `family`: of the
-    messages, None: OSI's. `window`: the log time of `source` that was read, None: all. `truth`: drawn beside the lists
-    unless it is None or a configuration has the name of its topics. `colours`: by configuration.
+    `run_chunks`: time chunk by time chunk, the fused tracks by configuration; values (1, P); and the lists of the units
+    that are to be written. `table`: the rows of the detections table of this log and run. `manifest`: what made the
+    file, kept as a metadata record. `family`: of the messages, None: OSI's. `window`: the log time of `source` that was
+    read, None: all. `truth`: drawn beside the lists unless it is None or a configuration has the name of its topics.
+    `colours`: by configuration.
 
     MCAP has no times before 0. If a list or a frame of the truth is earlier, all added messages are logged later by the
     same time, so that the first of them is at 0; stamps in messages stay by the log's clock.
@@ -92,20 +99,22 @@ def write_mcap(
     written; RecordingError: `source` can no longer be read.
     """
     original = open_source(source, window)
-    rest = iter(run_tracks)
-    first = next(rest)  # names the configurations and the units
+    rest = iter(run_chunks)
+    first, of_units = next(rest)  # names the configurations and the units
     units = [unit for fused_tracks in first.values() for unit in fused_tracks.received.units]
+    units += [unit.name for unit in of_units]
     numbers = {unit: k for k, unit in enumerate(dict.fromkeys(units), start=1)}
     tables = {name: table[table["configuration"] == name] for name in first}
     with atomic_mcap(path, profile=original.profile) as writer:
         catalogue = Catalogue(writer)
         ours = {topic for name in first for topic in (*list_topics(name), *list_extra_topics(name))} | {*TRUTH_TOPICS}
+        ours |= {topic for unit in of_units for topic in list_unit_topics(unit.name)}
         messages = original.messages(original.register(catalogue, without=ours))
         opened = (family or OSI)(catalogue, scene, numbers)
         encode = partial(_encode_chunk, opened, scene, tables, colours)
-        begun = list(encode(first))  # registers the channels, those of the lists first
+        begun = list(encode((first, of_units)))  # registers the channels, those of the lists first
         shown = [] if truth is None or TRUTH in first else [_encode_truth(opened.truth(), truth)]
-        del first
+        del first, of_units
         chunks = chain([begun], map(list, map(encode, rest)))
         added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_order_by_time, chunks)), *shown]))
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
@@ -155,15 +164,18 @@ def _encode_chunk(
     scene: Scene,
     tables: Mapping[str, pd.DataFrame],
     colours: Mapping[str, Rgb],
-    chunk: Mapping[str, FusedTracks],
+    run_chunk: RunLists,
 ) -> Iterator[TimedMessages]:
-    """The messages of each configuration in one time chunk: the lists of all first, then what is beside them."""
+    """The messages of one time chunk: the lists of all configurations, what is beside them, then the units' lists."""
+    chunk, unit_lists = run_chunk
     for name, fused_tracks in chunk.items():
         events = _find_events(fused_tracks.fused, tables[name])
         yield _encode_lists(scene, fused_tracks.fused, opened.channels(name, fused_tracks, events, colours[name]))
     for name, fused_tracks in chunk.items():
         statuses = Statuses(scene, fused_tracks, tables[name])
         yield _encode_lists(scene, fused_tracks.fused, opened.seen_besides(name, fused_tracks, statuses, colours[name]))
+    for unit in unit_lists:
+        yield _encode_lists(scene, unit.lists.fused, opened.unit_channels(unit))
 
 
 def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:

@@ -16,6 +16,8 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any, Protocol
 
+import numpy as np
+
 from copem_replay.core.colours import Rgb
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import TRUTH, Int, Scene
@@ -35,12 +37,14 @@ from copem_replay.io.write.detail import (
     STATUS_SCHEMA,
     DetailWriter,
     Event,
+    ReadyLists,
     Statuses,
     StatusWriter,
+    UnitDetailWriter,
     encode_statuses,
 )
 from copem_replay.io.write.osi import OSI_VERSION, SensorDataWriter
-from copem_replay.io.write.ros2 import DETECTED_OBJECTS, DetectedObjectsWriter
+from copem_replay.io.write.ros2 import DETECTED_OBJECTS, TRACKED_OBJECTS, ObjectsWriter
 from copem_replay.io.write.scene import FRAME_ID, BoxWriter, Draw, Encode, UncertaintyWriter, draw_scenes
 from copem_replay.io.write.source import OSI_CHANNEL, Catalogue
 
@@ -94,6 +98,11 @@ def list_extra_topics(configuration: str) -> list[str]:
     return [f"copem/{configuration}/{kind}" for kind in ("status", "uncertainty")]
 
 
+def list_unit_topics(unit: str) -> list[str]:
+    """The topics of a unit's lists: objects, detail."""
+    return [f"copem/units/{unit}/{kind}" for kind in ("objects", "detail")]
+
+
 RUN_RECORD = "org.copem_replay.run"
 """The metadata record of this project: what made the file."""
 TRUTH_TOPICS = [f"copem/{TRUTH}/{kind}" for kind in ("scene", "static", "transform")]
@@ -115,7 +124,7 @@ class OpenedFamily(ABC):
             self._schema(kind)
 
     @abstractmethod
-    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+    def _schema(self, kind: str, described: str = "") -> tuple[str, int, dict[str, str]]:
         """What a channel of a kind of message has: encoding, number of the schema, which is written, metadata."""
 
     @abstractmethod
@@ -126,14 +135,18 @@ class OpenedFamily(ABC):
     def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
         """The writers of the lists, and of their details."""
 
+    @abstractmethod
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
+        """The writers of a unit's lists, and of their details."""
+
     @staticmethod
     @abstractmethod
     def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:
         """Messages of the statuses at each instant."""
 
-    def _channel(self, topic: str, kind: str, configuration: str = "") -> int:
+    def _channel(self, topic: str, kind: str, described: str = "") -> int:
         """The number of a channel."""
-        return self._catalogue.channel(topic, *self._schema(kind, configuration))
+        return self._catalogue.channel(topic, *self._schema(kind, described))
 
     def channels(
         self, name: str, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]], colour: Rgb
@@ -142,7 +155,15 @@ class OpenedFamily(ABC):
         objects, details = self._objects(fused_tracks, events)
         writers = objects, BoxWriter(self._scene, fused_tracks, name, colour, self._draw), details
         kinds = zip(list_topics(name), ("objects", "scene", "detail"), strict=True)
-        return dict(zip((self._channel(topic, kind, name) for topic, kind in kinds), writers, strict=True))
+        described = f"fused object list of configuration {name}"
+        return dict(zip((self._channel(topic, kind, described) for topic, kind in kinds), writers, strict=True))
+
+    def unit_channels(self, unit: ReadyLists) -> dict[int, ListWriter]:
+        """The channels of a unit's lists: `objects`, `detail`."""
+        kinds = zip(list_unit_topics(unit.name), ("tracks" if unit.has_ids else "objects", "detail"), strict=True)
+        described = f"object list of unit {unit.name}"
+        numbers = (self._channel(topic, kind, described) for topic, kind in kinds)
+        return dict(zip(numbers, self._unit_lists(unit), strict=True))
 
     def seen_besides(
         self, name: str, fused_tracks: FusedTracks, statuses: Statuses, colour: Rgb
@@ -169,17 +190,17 @@ class _OsiFamily(OpenedFamily):
     osi = True
     encode_statuses = staticmethod(encode_statuses)
 
-    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
+    def _schema(self, kind: str, described: str = "") -> tuple[str, int, dict[str, str]]:
         if kind in ("detail", "status"):
-            name, schema = (DETAIL_SCHEMA, DETAIL_JSON) if kind == "detail" else (STATUS_SCHEMA, STATUS_JSON)
-            return "json", self._catalogue.schema(name, "jsonschema", json.dumps(schema).encode()), {}
-        described = _load_class(kind).DESCRIPTOR.full_name, "protobuf", _describe_class(_load_class(kind))
+            name, content = (DETAIL_SCHEMA, DETAIL_JSON) if kind == "detail" else (STATUS_SCHEMA, STATUS_JSON)
+            return "json", self._catalogue.schema(name, "jsonschema", json.dumps(content).encode()), {}
+        schema = _load_class(kind).DESCRIPTOR.full_name, "protobuf", _describe_class(_load_class(kind))
         about = {
-            f"{OSI_CHANNEL}description": f"fused object list of configuration {configuration}",
+            f"{OSI_CHANNEL}description": described,
             f"{OSI_CHANNEL}osi_version": OSI_VERSION,
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
-        return "protobuf", self._catalogue.schema(*described), about if kind == "objects" else {}
+        return "protobuf", self._catalogue.schema(*schema), about if kind in _OSI_LISTS else {}
 
     def _encoder(self, kind: str) -> Encode:
         return partial(encode_messages, _load_class(kind).DESCRIPTOR)
@@ -188,14 +209,21 @@ class _OsiFamily(OpenedFamily):
         scene = self._scene
         return [SensorDataWriter(scene, fused_tracks, self._units), DetailWriter(scene, fused_tracks, events)]
 
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
+        areas, crossed = unit.draw_areas if unit.fields else None, unit.lists.fused.cov_en_m2
+        beside = {} if crossed is None else {"cov_en_m2": crossed[0]}
+        objects = SensorDataWriter(self._scene, unit.lists, self._units, areas)
+        return [objects, UnitDetailWriter(self._scene, unit, beside)]
 
+
+_OSI_LISTS = ("objects", "tracks")
 OSI: Family = _OsiFamily
 """The family of all recordings but those of ROS 2."""
 
 
 def _load_class(kind: str) -> Any:
-    """The class of `objects`, `scene` or `transform` in protobuf, imported when first needed."""
-    if kind == "objects":
+    """The class of `objects`, `tracks`, `scene` or `transform` in protobuf, imported when first needed."""
+    if kind in _OSI_LISTS:
         return load_message_class(SENSOR_DATA)
     name = "SceneUpdate" if kind == "scene" else "FrameTransform"
     return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
@@ -211,6 +239,7 @@ def _describe_class(message_class: Any) -> bytes:
 
 _ROS2_TYPES = {
     "objects": DETECTED_OBJECTS,
+    "tracks": TRACKED_OBJECTS,
     "scene": "foxglove_msgs/msg/SceneUpdate",
     "detail": STRING,
     "status": "copem_replay_msgs/msg/Status",
@@ -219,20 +248,27 @@ _ROS2_TYPES = {
 
 
 class _Ros2Family(OpenedFamily):
-    """autoware_perception_msgs/DetectedObjects; foxglove_msgs/SceneUpdate; JSON of details as std_msgs/String."""
+    """DetectedObjects and TrackedObjects of Autoware; foxglove_msgs/SceneUpdate; JSON of details as std_msgs/String."""
 
     osi = False
 
-    def _schema(self, kind: str, configuration: str = "") -> tuple[str, int, dict[str, str]]:
-        described = _ROS2_TYPES[kind], "ros2msg", message_definition(_ROS2_TYPES[kind])
-        return "cdr", self._catalogue.schema(*described), {"offered_qos_profiles": QOS}
+    def _schema(self, kind: str, described: str = "") -> tuple[str, int, dict[str, str]]:
+        schema = _ROS2_TYPES[kind], "ros2msg", message_definition(_ROS2_TYPES[kind])
+        return "cdr", self._catalogue.schema(*schema), {"offered_qos_profiles": QOS}
 
     def _encoder(self, kind: str) -> Encode:
         return partial(encode_cdr, _ROS2_TYPES[kind])
 
     def _objects(self, fused_tracks: FusedTracks, events: Mapping[int, Sequence[Event]]) -> list[ListWriter]:
-        objects = DetectedObjectsWriter(self._scene, fused_tracks, self._frame_id)
+        objects = ObjectsWriter(self._scene, fused_tracks, self._frame_id)
         return [objects, _StringWriter(DetailWriter(self._scene, fused_tracks, events, sizes_of=objects.round))]
+
+    def _unit_lists(self, unit: ReadyLists) -> list[ListWriter]:
+        objects, fused = ObjectsWriter(self._scene, unit.lists, self._frame_id, tracked=unit.has_ids), unit.lists.fused
+        assert unit.lists.said is not None
+        beside = {n: np.where(objects.round, getattr(fused, n)[0], 0.0) for n in ("length_m", "width_m")}
+        beside["existence"] = unit.lists.said["existence"]  # of single precision in the messages
+        return [objects, _StringWriter(UnitDetailWriter(self._scene, unit, beside))]
 
     @staticmethod
     def encode_statuses(available_ns: Int, objects: RepeatedMessages) -> list[bytes]:

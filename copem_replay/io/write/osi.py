@@ -2,13 +2,14 @@
 
 Of a fused list, `timestamp` is the instant it is available, `last_measurement_time` the newest capture in it. Positions
 are in the log's world frame, as an identity `mounting_position` without a host location says (OSI's own frame for this
-message would be the virtual sensor's). `base_rmse` holds standard deviations, `ground_truth_id` the object's id in the
+message would be the virtual sensor's). What states no truth ids knows no stationary objects: all are moving ones.
+`base_rmse` holds standard deviations, `ground_truth_id` the object's id in the
 truth. A trace has neither a creation time nor any other clock: given content gives the same bytes each time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -177,13 +178,17 @@ _MEASURED, _STALE = 2, 1  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED
 class SensorDataWriter:
     """Turns the fused lists of one run (values (1, P)) into messages, many lists at once.
 
-    `unit_numbers` are the numbers by which `sensor_id` names the units that contributed.
+    `unit_numbers` are the numbers by which `sensor_id` names the units that contributed. `draw_areas`: the field of
+    view, of a unit whose lists they are.
     """
 
-    def __init__(self, scene: Scene, fused_tracks: FusedTracks, unit_numbers: Mapping[str, int]) -> None:
-        self._scene, self._fused_tracks = scene, fused_tracks
+    def __init__(
+        self, scene: Scene, fused_tracks: FusedTracks, unit_numbers: Mapping[str, int],
+        draw_areas: Callable[[int, int], RepeatedMessages] | None = None,
+    ) -> None:  # fmt: skip
+        self._scene, self._fused_tracks, self._draw_areas = scene, fused_tracks, draw_areas
         object_ix, claims, received = fused_tracks.fused.row_object_ix, fused_tracks.said, fused_tracks.received
-        self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True)
+        self._moving = np.where((object_ix >= 0) & (claims is None), scene.moving[object_ix], True)
         self._ids = np.array([osi_id(name) for name in scene.object_ids], dtype=np.uint64)
         numbers = np.array([unit_numbers[name] for name in received.units])
         if claims is None:
@@ -213,6 +218,8 @@ class SensorDataWriter:
                     captured_ns != NO_CAPTURE_NS, Instants(captured_ns[captured_ns != NO_CAPTURE_NS])
                 ),
             }
+            if self._draw_areas is not None:
+                content["virtual_detection_area"] = {"polygon": self._draw_areas(first, last)}
             frame = np.repeat(np.arange(len(lists)), lists)
             for name, kind in (("moving_object", self._moving[listed]), ("stationary_object", ~self._moving[listed])):
                 if not kind.any():

@@ -1,4 +1,4 @@
-"""Writing ROS 2 messages: fused lists as autoware_perception_msgs/DetectedObjects.
+"""Writing ROS 2 messages: lists as autoware_perception_msgs/DetectedObjects, of units with track ids TrackedObjects.
 
 `header.stamp` is the instant the list is available, `header.frame_id` the world of the recording. The twist is along
 the object, as in Autoware; a pedestrian is a cylinder whose diameter is the mean of its length and width. An unknown
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, Float, Int, Scene
@@ -25,6 +26,7 @@ from copem_replay.io.encodings.column_bytes import (
 from copem_replay.io.write.scene import pose_content
 
 DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
+TRACKED_OBJECTS = "autoware_perception_msgs/msg/TrackedObjects"
 
 LABELS = {
     "pedestrian": 7,
@@ -45,17 +47,17 @@ _BOUNDING_BOX, _CYLINDER = 0, 1  # Shape.type
 _AVAILABLE = 2  # DetectedObjectKinematics: the orientation is known in full
 
 
-class DetectedObjectsWriter:
-    """Turns the fused lists of one run (values (1, P)) into messages, many lists at once."""
+class ObjectsWriter:
+    """Turns the lists of one run (values (1, P)) into messages, many lists at once; `tracked`: into TrackedObjects."""
 
-    def __init__(self, scene: Scene, fused_tracks: FusedTracks, frame_id: str) -> None:
+    def __init__(self, scene: Scene, fused_tracks: FusedTracks, frame_id: str, *, tracked: bool = False) -> None:
         self._fused, self._rows, self._said = fused_tracks.fused, fused_tracks.listed_rows, fused_tracks.said
         object_ix = fused_tracks.fused.row_object_ix
-        self._moving = np.where(object_ix >= 0, scene.moving[object_ix], True)
+        self._moving = np.where((object_ix >= 0) & (self._said is None), scene.moving[object_ix], True)
         self._class_ix = fused_tracks.class_of(scene)
         self.round = self._class_ix == CLASSES.index("pedestrian")
         """(P,) which objects are cylinders."""
-        self._frame_id = frame_id
+        self._frame_id, self._tracked = frame_id, tracked
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
         """The lists as they became available at these instants of the log's clock, (F,)."""
@@ -70,7 +72,7 @@ class DetectedObjectsWriter:
                 "header": header,
                 "objects": RepeatedMessages(bounds[first : last + 1] - bounds[first], objects),
             }
-            yield from encode_cdr(DETECTED_OBJECTS, content, last - first)
+            yield from encode_cdr(TRACKED_OBJECTS if self._tracked else DETECTED_OBJECTS, content, last - first)
 
     def _objects(self, rows: Int) -> Content:
         fused, cylinder = self._fused, self.round[rows]
@@ -78,11 +80,18 @@ class DetectedObjectsWriter:
         across = (length + width) / 2
         size = {"x": np.where(cylinder, across, length), "y": np.where(cylinder, across, width), "z": height}
         return {
+            **({"object_id": {"uuid": self._uuids(rows)}} if self._tracked else {}),
             "existence_probability": 1.0 if self._said is None else self._said["existence"][rows],
             "classification": self._classes(rows),
             "kinematics": self._kinematics(rows),
             "shape": {"type": np.where(cylinder, _CYLINDER, _BOUNDING_BOX), "dimensions": size},
         }
+
+    def _uuids(self, rows: Int) -> NDArray[np.uint8]:
+        """(N, 16) track ids as big-endian numbers."""
+        assert self._said is not None
+        ids = self._said["track_id"][rows].astype(">u8").view(np.uint8).reshape(-1, 8)
+        return np.concatenate([np.zeros_like(ids), ids], axis=1)
 
     def _classes(self, rows: Int) -> RepeatedMessages:
         """The label of the true class, or the probability of each label, by the first of its classes."""
@@ -108,6 +117,11 @@ class DetectedObjectsWriter:
         east, cross, north, turn = (
             self._variance(name, rows) for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2")
         )
+        flags: Content = {
+            "has_position_covariance": (east > 0) & (north > 0),
+            "has_twist": moving,
+            "has_twist_covariance": fast > 0,
+        }
         return {
             "pose_with_covariance": {
                 "pose": pose_content(x, y, z, yaw),
@@ -115,14 +129,12 @@ class DetectedObjectsWriter:
                     len(rows), {(0, 0): east, (0, 1): cross, (1, 0): cross, (1, 1): north, (5, 5): turn}
                 ),
             },
-            "has_position_covariance": (east > 0) & (north > 0),
             "orientation_availability": _AVAILABLE,
             "twist_with_covariance": {
                 "twist": {"linear": {"x": cos * vx + sin * vy, "y": cos * vy - sin * vx}},
                 "covariance": _matrix(len(rows), {(0, 0): fast, (1, 1): fast}),
             },
-            "has_twist": moving,
-            "has_twist_covariance": fast > 0,
+            **({"is_stationary": ~moving} if self._tracked else flags),
         }
 
     def _variance(self, name: str, rows: Int) -> Float:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -15,6 +16,7 @@ from pydantic import (
     AfterValidator,
     Field,
     GetJsonSchemaHandler,
+    PrivateAttr,
     SerializerFunctionWrapHandler,
     field_validator,
     model_serializer,
@@ -22,8 +24,9 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
-from copem_replay.core.components import Component, Frozen, NotNegative, Number, Positive, Share, Slot
+from copem_replay.core.components import Component, Frozen, Id, NotNegative, Number, Positive, Share, Slot
 from copem_replay.core.memory import Memory, Parts
+from copem_replay.core.site_map import make_polygon
 from copem_replay.core.tracks import CLASSES, Float, Int
 from copem_replay.perception.pem.condition import (
     QUANTITIES,
@@ -151,6 +154,45 @@ class GivenPlaces(GhostPlace):
         return places
 
 
+Rings = tuple[tuple[tuple[float, float], ...], ...]
+
+
+class AreaPlace(GhostPlace):
+    """Uniform over the union of areas by name or kind: your own, and those of maps."""
+
+    kind: Literal["area"] = "area"
+    frame: ClassVar[Frame] = "world"
+    areas: Annotated[tuple[Id, ...], Field(min_length=1)]
+    _polygons_m: tuple[Rings, ...] = PrivateAttr(())  # of the log, set by `over`
+
+    def over(self, polygons_m: Iterable[Rings]) -> Self:
+        """The same with the polygons of its areas."""
+        copy = self.model_copy()
+        copy._polygons_m = tuple(polygons_m)
+        return copy
+
+    def places_m(self, uniform: Float, length_m: Float, width_m: Float) -> Float:
+        """In a triangle that the third number chooses by its size, at a place that the two others choose."""
+        corners_m, until = _cut_into_triangles(self._polygons_m)
+        a, b, c = corners_m[:, :, np.searchsorted(until, uniform[2])]
+        far = np.sqrt(uniform[0])
+        places: Float = a + far * (b - a) + far * uniform[1] * (c - b)
+        return places
+
+
+@lru_cache(maxsize=16)
+def _cut_into_triangles(polygons_m: tuple[Rings, ...]) -> tuple[Float, Float]:
+    """Triangles (3, 2, T) that cover polygons, and the share (T,) of the area up to each; in order of their places."""
+    import shapely
+
+    parts = shapely.get_parts(shapely.union_all([make_polygon(rings) for rings in polygons_m]))
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(parts[shapely.area(parts) > 0]))
+    corners_m = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    order = np.lexsort(corners_m.reshape(-1, 6).T)
+    until = np.cumsum(shapely.area(triangles)[order])
+    return corners_m[order].transpose(1, 2, 0), until / until[-1]
+
+
 class ObjectSidePlace(GhostPlace):
     """Uniform around objects of the given classes that the unit could list, within a distance of their sides."""
 
@@ -168,6 +210,7 @@ class ObjectSidePlace(GhostPlace):
 PLACES = {
     "field": "copem_replay.perception.pem.model:FieldPlace",
     "places": "copem_replay.perception.pem.model:GivenPlaces",
+    "area": "copem_replay.perception.pem.model:AreaPlace",
     "beside": "copem_replay.perception.pem.model:ObjectSidePlace",
 }
 """Built-in names of `ghosts: [{where: {kind: …}}]`."""
