@@ -391,6 +391,12 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line, error.key or None) for line in error.within(path)]
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
+    frame, why, of_frame = None, "", list[str]()
+    try:
+        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
+        recording = replace(recording, scene=replace(recording.scene, frame=frame))
+    except InputError as error:
+        wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
     lists, notes = {}, list(recording.notes)
     for name, asked in experiment.recorded.items():
         try:
@@ -415,13 +421,7 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     except RecordingError as error:
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
-    recording = replace(recording, scene=scene, lists=lists, notes=tuple(notes))
-    frame, why = None, ""
-    try:
-        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
-        recording = replace(recording, scene=replace(scene, frame=frame), notes=(*notes, *of_frame))
-    except InputError as error:
-        wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
+    recording = replace(recording, scene=scene, lists=lists, notes=(*notes, *of_frame))
     far = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
     experiment = resolve_degrees(experiment, frame)
     recording, disagreeing = add_maps(recording, experiment.maps, frame)

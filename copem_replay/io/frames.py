@@ -418,7 +418,7 @@ def read_decoded_lists(
     return replace(lists, part=channel.part, columns=columns)
 
 
-def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:
+def transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:
     """Values (K, len(VALUES)) and covariances (K, 3) of rows, transformed by the pose at their `instant (K,)`."""
     values = values.copy()
     values[:, X : Z + 1] = rotate_vectors(placed.rotation[instant], values[:, X : Z + 1]) + placed.position_m[instant]
@@ -476,7 +476,7 @@ def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topi
                 path=path,
                 topic=topic,
             )
-        values[rows], covariance[rows] = _transform_rows(values[rows], covariance[rows], placed, instant)
+        values[rows], covariance[rows] = transform_rows(values[rows], covariance[rows], placed, instant)
         has_place[rows] = placed.there[instant]
         notes.append(f"lists in the frame {name}: brought into {world}")
         if lost := int((~placed.there[instant]).sum()):

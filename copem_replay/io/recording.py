@@ -365,6 +365,8 @@ def _decode_world(
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
     around = replace(around, classes=classes)
     lists = read_decoded_lists(log, same_schema, fields, classes)
+    if lists.station is not None:
+        raise RecordingError("its positions are relative to stations; " + _NO_TRUTH, path=log.path, topic=topic)
     if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
         raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
     if not lists.named and len(lists.columns.object_ix):

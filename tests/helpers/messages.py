@@ -20,7 +20,7 @@ def defined(text: str, name: str = "p/msg/A", encoding: str = "ros2msg") -> CdrD
 
 
 def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
-    """By rosbags."""
+    """By rosbags; fields that the message lacks are 0, or empty."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, name))
 
@@ -33,8 +33,8 @@ def serialised(text: str, message: dict[str, Any], *, little: bool = True, name:
         if kind == 1:
             return value
         if kind == 2:
-            return made(detail, value)
-        item = detail[0]
+            return made(detail, value or {})
+        item, value = detail[0], [] if isinstance(value, int) else value
         if int(item[0]) == 1 and item[1][0] != "string":
             return np.array(value, dtype={"byte": "u1", "char": "u1"}.get(item[1][0], item[1][0]))
         return [filled(item, v) for v in value]

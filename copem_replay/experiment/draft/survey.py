@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -112,11 +113,15 @@ def _survey_topics(log: Log) -> list[TopicFound]:
 
 def _survey_units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
     """The lists of each unit; `problem` where they cannot be read."""
+    scene = recording.scene
+    if topics and recording.place_said is not None:
+        with suppress(InputError):  # the line on its place says why
+            scene = replace(scene, frame=recording.place_said.read()[0])
     for topic in dict.fromkeys(topics):
         from copem_replay.io.recorded_lists import read_unit_lists  # it takes time, and most recordings have no lists
 
         try:
-            lists = read_unit_lists(recording.local, topic, recording.scene, recording.around)
+            lists = read_unit_lists(recording.local, topic, scene, recording.around)
         except RecordingError as error:
             yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
             continue

@@ -6,9 +6,9 @@ reference, start at the message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -112,13 +112,37 @@ class StaysField:
 
 
 @dataclass(frozen=True)
+class Made:
+    """A column of numbers that messages have in other units, or in parts: `make` of the columns at the paths `of`.
+
+    These are of the list that the column is in, or of one around it.
+    """
+
+    of: tuple[str, ...]
+    make: Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class StationFields:
+    """Paths of the place, in degrees, that positions are relative to, east and north of it.
+
+    `after_s`: that of the time from the stamp of the message to the measurement of an object.
+    """
+
+    latitude_deg: str
+    longitude_deg: str
+    after_s: str
+
+
+@dataclass(frozen=True)
 class Description:
     """A format: its fields, the values of paths that select objects (`only`), and the path an id is unique `within`.
 
     `said`: paths of numbers that are 0 where an object does not state its `yaw`, `velocity`, `covariance`. `footprint`:
     the points of an object's outline, with x and y along its axes, for objects without length and width. `solid`: the
     fields of its shape. `largest_of`: the list of things that may have several bodies, of which the largest counts.
-    `stays`: how things end that exist until a message removes them.
+    `stays`: how things end that exist until a message removes them. `made`: columns by the paths that name them.
+    `station`: the station that the positions are relative to.
     """
 
     fields: Fields
@@ -129,3 +153,5 @@ class Description:
     solid: SolidField | None = None
     largest_of: str | None = None
     stays: StaysField | None = None
+    made: Mapping[str, Made] = field(default_factory=dict)
+    station: StationFields | None = None

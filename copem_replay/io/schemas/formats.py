@@ -2,18 +2,21 @@
 
 The definitions in recordings differ between releases; a description is made for the paths that the messages offer.
 Sources: the packages' own message definitions (autoware_perception_msgs, autoware_auto_perception_msgs, vision_msgs,
-derived_object_msgs, visualization_msgs; foxglove.SceneUpdate).
+derived_object_msgs, visualization_msgs, ika's perception_msgs; foxglove.SceneUpdate).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Literal
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal
+
+import numpy as np
 
 from copem_replay.io.schemas.description import (
     ClassField,
     Description,
     Fields,
+    Made,
     SolidField,
     StaysField,
     Yaw,
@@ -46,6 +49,18 @@ _DERIVED = {
     "8": "motorcycle",
     "9": "vehicle",
 }
+
+# perception_msgs/ObjectClassification.msg
+_IKA = {
+    **{"1": "pedestrian", "2": "bicycle", "3": "motorcycle", "4": "car", "5": "truck", "6": "van", "7": "bus"},
+    **{"8": "animal", "9": "other", "10": "other", "11": "trailer", "12": "pedestrian", "13": "bicycle"},
+    **{"50": "car", "51": "truck", "52": "bicycle", "100": "other"},
+}
+_IKA_STATES = {
+    16: {"x": 0, "y": 1, "z": 2, "along": 3, "left": 4, "yaw": 7, "width": 9, "length": 10, "height": 11, "of": 12},
+    17: {"x": 0, "y": 1, "z": 2, "along": 3, "left": 4, "yaw": 9, "length": 13, "width": 14, "height": 15, "of": 16},
+}
+"""By model (ISCACTR, HEXAMOTION) the places of its quantities in the vector of the state, and their number, `of`."""
 
 
 def autoware(offers: Collection[str]) -> Description:
@@ -158,6 +173,55 @@ def markers(offers: Collection[str]) -> Description:
         only={"type": ("1",), "action": ("0",)},  # CUBE; ADD, which is MODIFY too
         within="ns",
         stays=StaysField("markers[].lifetime", "markers[].action", None, ("2",), ("3",)),
+    )
+
+
+def perception(offers: Collection[str]) -> Description:
+    """perception_msgs/ObjectList of ika: states of ISCACTR and HEXAMOTION, moved to the centre of the box."""
+    model, centre = "state.model_id", "state.reference_point.translation_to_geometric_center"
+
+    def pick(names: str, path: str = "state.continuous_state") -> tuple[str, ...]:
+        """The paths of quantities in the state of each model, after that of the model."""
+        return (model, *(f"{path}[{at[name]}]" for name in names.split() for at in _IKA_STATES.values()))
+
+    def choose(of: Any, *values: Any) -> list[Any]:
+        """Of quantities by model (Q · models) those of the model, NaN: of another one."""
+        models = [of == number for number in _IKA_STATES]
+        pairs = (values[k : k + len(models)] for k in range(0, len(values), len(models)))
+        return [np.select(models, list(pair), np.nan) for pair in pairs]
+
+    def move(axis: int) -> Callable[..., Any]:
+        def make(*of: Any) -> Any:
+            (at, yaw), (ahead, left) = choose(*of[:-2]), of[-2:]
+            return at + (np.sin(yaw) * ahead + np.cos(yaw) * left if axis else np.cos(yaw) * ahead - np.sin(yaw) * left)
+
+        return make
+
+    names = {"yaw_rad": "yaw", "length_m": "length", "width_m": "width", "height_m": "height"}
+    names |= {"vx_mps": "along", "vy_mps": "left"}
+    made = {field: Made(pick(name), lambda *of: choose(*of)[0]) for field, name in names.items()}
+    for k, axis in enumerate("xy"):
+        made[f"{axis}_m"] = Made((*pick(f"{axis} yaw"), f"{centre}.x", f"{centre}.y"), move(k))
+    made["z_m"] = Made((*pick("z"), f"{centre}.z"), lambda *of: choose(*of[:-1])[0] + of[-1])
+    for place, (row, column) in {0: (0, 0), 1: (0, 1), 7: (1, 1)}.items():
+        cells = (f"state.continuous_state_covariance[{row * at['of'] + column}]" for at in _IKA_STATES.values())
+        made[f"covariance[{place}]"] = Made((model, *cells), lambda *of: choose(*of)[0])
+    fields = {
+        "objects": "objects[]",
+        "stamp": "header.stamp",
+        "frame": "header.frame_id",
+        "id": "id",
+        "class": {
+            "path": "state.classifications[].type",
+            "map": _IKA,
+            "probability": "state.classifications[].probability",
+        },
+        "velocity": "object",
+        "existence": "existence_probability",
+        "covariance": "covariance",
+    }
+    return Description(
+        Fields.model_validate(fields | {name: name for name in made if not name.startswith("covariance")}), made=made
     )
 
 

@@ -23,6 +23,7 @@ from copem_replay.io.encodings.columns import (
     ancestor_rows,
     any_item_path,
     common_level,
+    format_number,
     list_level,
     list_levels,
     shred_messages,
@@ -58,7 +59,9 @@ class WantedPaths:
     """
 
     def __init__(self, description: Description, offers: Collection[str]) -> None:
-        self._fields, self._described, self._offers = description.fields, description, offers
+        self._fields, self._described = description.fields, description
+        self.made = {self.path(name): made for name, made in description.made.items()}
+        self._offers = dict.fromkeys([*offers, *map(any_item_path, self.made)])
         objects = any_item_path(self._fields.objects)
         lists = {level for path in offers for level in list_levels([path]) if level}
         if objects not in lists or not self._fields.objects.endswith("[]"):
@@ -146,7 +149,25 @@ class WantedPaths:
             self.removal = paths if {*paths} <= {*self._offers} else []
             texts += self.lifetime + self.removal
         texts += self.stamp
+        if (station := described.station) is not None:
+            numbers += map(self.path, (station.latitude_deg, station.longitude_deg, station.after_s))
+        numbers += [self._need("made", self.path(path)) for made in self.made.values() for path in made.of]
         return numbers, texts
+
+    def shred(self, definition: Definition, payloads: Sequence[bytes]) -> ShreddedMessages:
+        """The columns of messages, with those that are made of others."""
+        plain = ([path for path in paths if path not in self.made] for paths in (self.numbers, self.texts))
+        found = shred_messages(definition, payloads, *plain)
+        for name, made in self.made.items():
+            rows = found.levels[list_level(name)]
+            parts = ((path, list_level(path)) for path in map(self.path, made.of))
+            columns = [found.levels[of].numbers[p][ancestor_rows(found, list_level(name), of)] for p, of in parts]
+            rows.numbers[name] = values = made.make(*columns)
+            if name in self.texts:
+                distinct, code = np.unique(values, return_inverse=True)
+                words = tuple(map(format_number, distinct.tolist()))
+                rows.texts[name] = DistinctTexts(np.where(np.isnan(values), -1, code), words)
+        return found
 
     def _stamp_paths(self) -> list[str]:
         stamp = self._fields.stamp
@@ -253,6 +274,17 @@ __all__ = ["ClassField", "DecodedLists", "Description", "Fields", "FieldsError",
 
 
 @dataclass(frozen=True)
+class Station:
+    """The station that lists are relative to. `place (F, 2)`: latitude and longitude in degrees, NaN: not said.
+
+    `after_s (P,)`: when objects were measured, in s after the stamp of their list.
+    """
+
+    place: Float
+    after_s: Float
+
+
+@dataclass(frozen=True)
 class DecodedLists:
     """The lists of one topic, with properties of entries that only recorded units need, (P,) each.
 
@@ -268,6 +300,7 @@ class DecodedLists:
     probability: Float
     named: bool  # whether its objects have ids
     part: str = ""  # the recording they are from, of several of one drive
+    station: Station | None = None  # that positions are relative to, in m east and north of it
 
 
 def decode_lists(
@@ -295,7 +328,7 @@ class _BatchReader:
         self._description = description
         self._notes: list[str] = []
         self._wanted = WantedPaths(description, definition.offers())
-        self._found: ShreddedMessages = shred_messages(definition, payloads, self._wanted.numbers, self._wanted.texts)
+        self._found = self._wanted.shred(definition, payloads)
         self._names = definition.names
         check_objects(int(np.bincount(ancestor_rows(self._found, self._fields.objects, "")).max(initial=0)))
         self._messages = len(payloads)
@@ -516,6 +549,15 @@ class _BatchReader:
         covariance[~self._said("covariance")[keep]] = np.nan
         return covariance
 
+    def _station(self, message: Int, keep: Int) -> Station | None:
+        """The station of the messages (F,) and of the objects `keep` (K,)."""
+        fields = self._description.station
+        if fields is None:
+            return None
+        of = self._found.levels[""]
+        place = [of.numbers[self._wanted.path(path)] for path in (fields.latitude_deg, fields.longitude_deg)]
+        return Station(np.stack(place, axis=1)[np.searchsorted(of.parent, message)], self.number(fields.after_s)[keep])
+
     def _with_standing(
         self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float
     ) -> tuple[Int, Int]:
@@ -597,6 +639,7 @@ class _BatchReader:
             self._covariance(keep),
             probability,
             ids is not None,
+            station=self._station(kept_message, keep),
         )
 
 
