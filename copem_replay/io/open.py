@@ -24,6 +24,7 @@ from copem_replay.core.errors import RecordingError, RemoteFile
 from copem_replay.io.channel import Channel
 from copem_replay.io.containers.osi_trace import is_trace, open_trace
 from copem_replay.io.containers.rosbag2 import METADATA, list_bag_files, merge_streams, open_bag
+from copem_replay.io.containers.sqlite import is_sqlite, open_sqlite
 from copem_replay.io.log import BrokenIndexError, Log, open_file, open_mcap
 from copem_replay.io.window import ALWAYS, Window
 
@@ -302,6 +303,8 @@ def find_drive_recordings(log: Log) -> DriveRecordings | None:
 def _open_one(path: Path) -> Log:
     if path.is_dir():
         return open_bag(path)
+    if is_sqlite(path):
+        return open_sqlite(path)
     return open_trace(path) if is_trace(path) else open_mcap(path)  # of any other path its error says what it is
 
 

@@ -421,10 +421,9 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
     around = around or read_log_context(log, None, seek_ego=False)
     lists = read_decoded_lists(log, same_schema, None, around.classes)
     if lists.station is not None:
-        lists, station = place_on_earth(lists, lists.station, scene.frame, log.path, topic)
-        return _make_recorded_lists(
-            *settle_measurements(lists, station, scene.t0_ns, log.path, topic), {}, log.path, topic, scene
-        )
+        lists = place_on_earth(lists, lists.station, scene.frame, log.path, topic)
+        settled = settle_measurements(lists, scene.t0_ns, log.path, topic)
+        return _make_recorded_lists(*settled, {}, log.path, topic, scene)
     lists = transform_to_world(lists, around, log.path, topic)
     details = _read_details(log, topic)
     return _make_recorded_lists(

@@ -545,4 +545,7 @@ def test_json_scenes_may_leave_out_much() -> None:
 def test_what_is_known_by_name() -> None:
     scenes = {"foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate"}
     assert scenes < set(SCHEMAS)
-    assert len(SCHEMAS) == 9 + len(scenes)
+    ours = {name for name in SCHEMAS if name.split("/")[0] in ("perception_msgs", "ika_perception_msgs")}
+    stations = {name for name in SCHEMAS if "SensorDataSharing" in name or "CollectivePerception" in name}
+    assert len(SCHEMAS) == 9 + len(scenes) + len(ours) + len(stations)
+    assert (len(ours), len(stations)) == (2, 3)

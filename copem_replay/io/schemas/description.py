@@ -6,7 +6,7 @@ reference, start at the message.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -89,14 +89,6 @@ class Fields(Frozen):
 
 
 @dataclass(frozen=True)
-class SolidField:
-    """The paths of an object's type of solid (box, sphere, cylinder, cone) and of its dimensions (shape_msgs)."""
-
-    kind: str
-    dimensions: str
-
-
-@dataclass(frozen=True)
 class StaysField:
     """Paths, from the message, of what ends a thing: its `lifetime` (0: none does), and removals.
 
@@ -111,27 +103,8 @@ class StaysField:
     all: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Made:
-    """A column of numbers that messages have in other units, or in parts: `make` of the columns at the paths `of`.
-
-    These are of the list that the column is in, or of one around it.
-    """
-
-    of: tuple[str, ...]
-    make: Callable[..., Any]
-
-
-@dataclass(frozen=True)
-class StationFields:
-    """Paths of the place, in degrees, that positions are relative to, east and north of it.
-
-    `after_s`: that of the time from the stamp of the message to the measurement of an object.
-    """
-
-    latitude_deg: str
-    longitude_deg: str
-    after_s: str
+Made = tuple[Any, ...]
+"""A column of numbers that messages have in other units, or in parts: what makes it, and of which columns."""
 
 
 @dataclass(frozen=True)
@@ -139,10 +112,11 @@ class Description:
     """A format: its fields, the values of paths that select objects (`only`), and the path an id is unique `within`.
 
     `said`: paths of numbers that are 0 where an object does not state its `yaw`, `velocity`, `covariance`. `footprint`:
-    the points of an object's outline, with x and y along its axes, for objects without length and width. `solid`: the
-    fields of its shape. `largest_of`: the list of things that may have several bodies, of which the largest counts.
-    `stays`: how things end that exist until a message removes them. `made`: columns by the paths that name them.
-    `station`: the station that the positions are relative to.
+    the points of an object's outline, with x and y along its axes, for objects without length and width. `largest_of`:
+    the list of things that may have several bodies, of which the largest counts. `stays`: how things end that exist
+    until a message removes them. `made`: columns by the paths that name them. `station`: whether positions are east and
+    north of a station: then columns are made of its `/latitude_deg` and `/longitude_deg`, and of `after_s`, the time
+    from the stamp to the measurement of an object.
     """
 
     fields: Fields
@@ -150,8 +124,7 @@ class Description:
     within: str | None = None
     said: Mapping[Literal["yaw", "velocity", "covariance"], str] = field(default_factory=dict)
     footprint: str | None = None
-    solid: SolidField | None = None
     largest_of: str | None = None
     stays: StaysField | None = None
     made: Mapping[str, Made] = field(default_factory=dict)
-    station: StationFields | None = None
+    station: bool = False

@@ -17,7 +17,6 @@ from copem_replay.io.schemas.description import (
     Description,
     Fields,
     Made,
-    SolidField,
     StaysField,
     Yaw,
 )
@@ -56,11 +55,13 @@ _IKA = {
     **{"8": "animal", "9": "other", "10": "other", "11": "trailer", "12": "pedestrian", "13": "bicycle"},
     **{"50": "car", "51": "truck", "52": "bicycle", "100": "other"},
 }
-_IKA_STATES = {
-    16: {"x": 0, "y": 1, "z": 2, "along": 3, "left": 4, "yaw": 7, "width": 9, "length": 10, "height": 11, "of": 12},
-    17: {"x": 0, "y": 1, "z": 2, "along": 3, "left": 4, "yaw": 9, "length": 13, "width": 14, "height": 15, "of": 16},
-}
-"""By model (ISCACTR, HEXAMOTION) the places of its quantities in the vector of the state, and their number, `of`."""
+
+
+def _box(pose: str, size: str) -> dict[str, Any]:
+    """The fields of a box: its pose and its size."""
+    place = {f"{axis}_m": f"{pose}.position.{axis}" for axis in "xyz"}
+    sides = {f"{side}_m": f"{size}.{axis}" for side, axis in zip(("length", "width", "height"), "xyz", strict=True)}
+    return {**place, "yaw_rad": Yaw(quaternion=f"{pose}.orientation"), **sides}
 
 
 def autoware(offers: Collection[str]) -> Description:
@@ -82,13 +83,7 @@ def autoware(offers: Collection[str]) -> Description:
                     "map": _AUTOWARE,
                     "probability": "classification[].probability",
                 },
-                "x_m": f"{pose}.pose.position.x",
-                "y_m": f"{pose}.pose.position.y",
-                "z_m": f"{pose}.pose.position.z",
-                "yaw_rad": {"quaternion": f"{pose}.pose.orientation"},
-                "length_m": "shape.dimensions.x",
-                "width_m": "shape.dimensions.y",
-                "height_m": "shape.dimensions.z",
+                **_box(f"{pose}.pose", "shape.dimensions"),
                 "vx_mps": f"{twist}.twist.linear.x",
                 "vy_mps": f"{twist}.twist.linear.y",
                 "velocity": "object",
@@ -113,42 +108,41 @@ def detection3d(offers: Collection[str]) -> Description:
         "id": ident,
         "class": {"path": f"results[].{kind}", "probability": f"results[].{score}"},
         "existence": f"results[0].{score}",
-        "x_m": "bbox.center.position.x",
-        "y_m": "bbox.center.position.y",
-        "z_m": "bbox.center.position.z",
-        "yaw_rad": {"quaternion": "bbox.center.orientation"},
-        "length_m": "bbox.size.x",
-        "width_m": "bbox.size.y",
-        "height_m": "bbox.size.z",
+        **_box("bbox.center", "bbox.size"),
     }
     if "detections[].results[].pose.covariance[]" in offers:
         fields["covariance"] = "results[0].pose.covariance"
     return Description(Fields.model_validate(fields))
 
 
+def _solid(side: int) -> Callable[..., Any]:
+    """What makes a side of the box around a solid: of a sphere 2, of a cylinder 3 and a cone 4 height and radius."""
+
+    def make(kind: Any, *sides: Any) -> Any:
+        across = 2.0 * np.where(kind == 2, sides[0], sides[1])
+        height = np.where(kind == 2, across, sides[0])
+        return np.where((kind >= 2) & (kind <= 4), height if side == 2 else across, sides[side])
+
+    return make
+
+
 def derived(offers: Collection[str]) -> Description:
     """derived_object_msgs/ObjectArray, as the CARLA bridge writes it: twist along the axes of the list."""
-    return Description(
-        Fields.model_validate(
-            {
-                "objects": "objects[]",
-                "stamp": "header.stamp",
-                "frame": "header.frame_id",
-                "id": "id",
-                "class": ClassField(path="classification", map=_DERIVED),
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
-                "length_m": "shape.dimensions[0]",
-                "width_m": "shape.dimensions[1]",
-                "height_m": "shape.dimensions[2]",
-                "vx_mps": "twist.linear.x",
-                "vy_mps": "twist.linear.y",
-            }
-        ),
-        solid=SolidField("shape.type", "shape.dimensions") if "objects[].shape.type" in offers else None,
-    )
+    sides = [f"shape.dimensions[{k}]" for k in range(3)]
+    made: dict[str, Made] = {f"box[{k}]": (_solid(k), "shape.type", *sides) for k in range(3)}
+    made, sides = (made, [*made]) if "objects[].shape.type" in offers else ({}, sides)
+    fields = {
+        "objects": "objects[]",
+        "stamp": "header.stamp",
+        "frame": "header.frame_id",
+        "id": "id",
+        "class": ClassField(path="classification", map=_DERIVED),
+        **_box("pose", "shape"),
+        **dict(zip(("length_m", "width_m", "height_m"), sides, strict=True)),
+        "vx_mps": "twist.linear.x",
+        "vy_mps": "twist.linear.y",
+    }
+    return Description(Fields.model_validate(fields), made=made)
 
 
 def markers(offers: Collection[str]) -> Description:
@@ -161,13 +155,7 @@ def markers(offers: Collection[str]) -> Description:
                 "frame": "markers[].header.frame_id",
                 "id": "id",
                 "class": ClassField(path="ns"),
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
-                "length_m": "scale.x",
-                "width_m": "scale.y",
-                "height_m": "scale.z",
+                **_box("pose", "scale"),
             }
         ),
         only={"type": ("1",), "action": ("0",)},  # CUBE; ADD, which is MODIFY too
@@ -176,53 +164,54 @@ def markers(offers: Collection[str]) -> Description:
     )
 
 
+def _by_model(model: Any, iscactr: Any, hexamotion: Any) -> Any:
+    return np.select([model == 16, model == 17], [iscactr, hexamotion], np.nan)
+
+
+def _state(iscactr: int, hexamotion: int, of: str = "continuous_state") -> tuple[str, ...]:
+    """The paths of the model of a state, and of a quantity where each model has it."""
+    return ("state.model_id", f"state.{of}[{iscactr}]", f"state.{of}[{hexamotion}]")
+
+
 def perception(offers: Collection[str]) -> Description:
     """perception_msgs/ObjectList of ika: states of ISCACTR and HEXAMOTION, moved to the centre of the box."""
-    model, centre = "state.model_id", "state.reference_point.translation_to_geometric_center"
+    centre, yaw = "state.reference_point.translation_to_geometric_center", _state(7, 9)
+    cells, place = "continuous_state_covariance", "state.continuous_state"
 
-    def pick(names: str, path: str = "state.continuous_state") -> tuple[str, ...]:
-        """The paths of quantities in the state of each model, after that of the model."""
-        return (model, *(f"{path}[{at[name]}]" for name in names.split() for at in _IKA_STATES.values()))
-
-    def choose(of: Any, *values: Any) -> list[Any]:
-        """Of quantities by model (Q · models) those of the model, NaN: of another one."""
-        models = [of == number for number in _IKA_STATES]
-        pairs = (values[k : k + len(models)] for k in range(0, len(values), len(models)))
-        return [np.select(models, list(pair), np.nan) for pair in pairs]
-
-    def move(axis: int) -> Callable[..., Any]:
-        def make(*of: Any) -> Any:
-            (at, yaw), (ahead, left) = choose(*of[:-2]), of[-2:]
-            return at + (np.sin(yaw) * ahead + np.cos(yaw) * left if axis else np.cos(yaw) * ahead - np.sin(yaw) * left)
+    def move(turn: Callable[[Any], tuple[Any, Any]]) -> Callable[..., Any]:
+        def make(at: Any, ahead: Any, left: Any, *yaw: Any) -> Any:
+            by_ahead, by_left = turn(_by_model(*yaw))
+            return at + by_ahead * ahead + by_left * left
 
         return make
 
-    names = {"yaw_rad": "yaw", "length_m": "length", "width_m": "width", "height_m": "height"}
-    names |= {"vx_mps": "along", "vy_mps": "left"}
-    made = {field: Made(pick(name), lambda *of: choose(*of)[0]) for field, name in names.items()}
-    for k, axis in enumerate("xy"):
-        made[f"{axis}_m"] = Made((*pick(f"{axis} yaw"), f"{centre}.x", f"{centre}.y"), move(k))
-    made["z_m"] = Made((*pick("z"), f"{centre}.z"), lambda *of: choose(*of[:-1])[0] + of[-1])
-    for place, (row, column) in {0: (0, 0), 1: (0, 1), 7: (1, 1)}.items():
-        cells = (f"state.continuous_state_covariance[{row * at['of'] + column}]" for at in _IKA_STATES.values())
-        made[f"covariance[{place}]"] = Made((model, *cells), lambda *of: choose(*of)[0])
+    made: dict[str, Made] = {
+        "x_m": (move(lambda a: (np.cos(a), -np.sin(a))), f"{place}[0]", f"{centre}.x", f"{centre}.y", *yaw),
+        "y_m": (move(lambda a: (np.sin(a), np.cos(a))), f"{place}[1]", f"{centre}.x", f"{centre}.y", *yaw),
+        "z_m": (np.add, f"{place}[2]", f"{centre}.z"),
+        "yaw_rad": (_by_model, *yaw),
+        "length_m": (_by_model, *_state(10, 13)),
+        "width_m": (_by_model, *_state(9, 14)),
+        "height_m": (_by_model, *_state(11, 15)),
+        "covariance[0]": (_by_model, *_state(0, 0, cells)),
+        "covariance[1]": (_by_model, *_state(1, 1, cells)),
+        "covariance[7]": (_by_model, *_state(13, 17, cells)),
+    }
+    kinds = "state.classifications[]"
     fields = {
         "objects": "objects[]",
         "stamp": "header.stamp",
         "frame": "header.frame_id",
         "id": "id",
-        "class": {
-            "path": "state.classifications[].type",
-            "map": _IKA,
-            "probability": "state.classifications[].probability",
-        },
+        "class": {"path": f"{kinds}.type", "map": _IKA, "probability": f"{kinds}.probability"},
+        "vx_mps": f"{place}[3]",
+        "vy_mps": f"{place}[4]",
         "velocity": "object",
         "existence": "existence_probability",
         "covariance": "covariance",
+        **{name: name for name in made if name.endswith(("_m", "_rad"))},
     }
-    return Description(
-        Fields.model_validate(fields | {name: name for name in made if not name.startswith("covariance")}), made=made
-    )
+    return Description(Fields.model_validate(fields), made=made)
 
 
 _MATCHING = ("0", "MATCHING_ID", "")
@@ -244,13 +233,7 @@ def description(offers: Collection[str]) -> Description:
                 "frame": "entities[].frame_id" if "entities[].frame_id" in offers else None,
                 "id": "/entities[].id" if "entities[].id" in offers else None,
                 "class": class_field if classes else None,
-                "x_m": "pose.position.x",
-                "y_m": "pose.position.y",
-                "z_m": "pose.position.z",
-                "yaw_rad": Yaw(quaternion="pose.orientation"),
-                "length_m": "size.x",
-                "width_m": "size.y",
-                "height_m": "size.z",
+                **_box("pose", "size"),
             }
         ),
         largest_of="entities[]",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -138,9 +138,6 @@ class WantedPaths:
         texts += [self._of_object("only", path) for path in described.only]
         if described.within is not None:
             texts.append(self._of_object("id", described.within))
-        if described.solid is not None:
-            numbers += [self._of_object("length_m", described.solid.kind)]
-            numbers += [self._of_object("length_m", f"{described.solid.dimensions}[{k}]") for k in range(2)]
         self.lifetime: list[str] = []
         self.removal: list[str] = []
         if (stays := described.stays) is not None:
@@ -149,20 +146,17 @@ class WantedPaths:
             self.removal = paths if {*paths} <= {*self._offers} else []
             texts += self.lifetime + self.removal
         texts += self.stamp
-        if (station := described.station) is not None:
-            numbers += map(self.path, (station.latitude_deg, station.longitude_deg, station.after_s))
-        numbers += [self._need("made", self.path(path)) for made in self.made.values() for path in made.of]
+        numbers += [self._need("made", self.path(path)) for _, *of in self.made.values() for path in of]
         return numbers, texts
 
     def shred(self, definition: Definition, payloads: Sequence[bytes]) -> ShreddedMessages:
         """The columns of messages, with those that are made of others."""
         plain = ([path for path in paths if path not in self.made] for paths in (self.numbers, self.texts))
         found = shred_messages(definition, payloads, *plain)
-        for name, made in self.made.items():
-            rows = found.levels[list_level(name)]
-            parts = ((path, list_level(path)) for path in map(self.path, made.of))
-            columns = [found.levels[of].numbers[p][ancestor_rows(found, list_level(name), of)] for p, of in parts]
-            rows.numbers[name] = values = made.make(*columns)
+        for name, (make, *of) in self.made.items():
+            rows, parts = found.levels[list_level(name)], [(path, list_level(path)) for path in map(self.path, of)]
+            columns = (found.levels[at].numbers[p][ancestor_rows(found, list_level(name), at)] for p, at in parts)
+            rows.numbers[name] = values = make(*columns)
             if name in self.texts:
                 distinct, code = np.unique(values, return_inverse=True)
                 words = tuple(map(format_number, distinct.tolist()))
@@ -180,10 +174,8 @@ class WantedPaths:
         return paths
 
 
-# Boxes of objects whose shape is an outline, a solid other than a box, or several bodies.
+# Boxes of objects whose shape is an outline, or several bodies.
 
-_SPHERE, _CYLINDER, _CONE = 2, 3, 4
-"""Types of shape_msgs/SolidPrimitive; a cylinder and a cone have a height and a radius."""
 _YAW = VALUES.index("yaw_rad")
 _SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
 _SIZES = slice(VALUES.index("length_m"), VALUES.index("height_m") + 1)
@@ -206,18 +198,6 @@ def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint
     values[flat, _SIZE] = most[flat] - least[flat]
     values[flat, 0] += middle[:, 0] * np.cos(yaw) - middle[:, 1] * np.sin(yaw)
     values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
-
-
-def fit_solids(values: Float, kind: Float, first: Float, second: Float) -> None:
-    """Set the sizes in `values (P, V)` of solids other than boxes to those of the box around them.
-
-    `kind (P,)`: the type of shape_msgs/SolidPrimitive; `first (P,)` and `second (P,)`: its first two dimensions.
-    """
-    ball, upright = kind == _SPHERE, (kind == _CYLINDER) | (kind == _CONE)
-    across = 2.0 * np.where(ball, first, second)
-    height = np.where(ball, across, first)
-    round_ = ball | upright
-    values[round_, _SIZES] = np.stack([across, across, height], axis=1)[round_]
 
 
 def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: str, of: str) -> Bool:
@@ -301,6 +281,16 @@ class DecodedLists:
     named: bool  # whether its objects have ids
     part: str = ""  # the recording they are from, of several of one drive
     station: Station | None = None  # that positions are relative to, in m east and north of it
+
+    def take_rows(self, kept: Bool) -> DecodedLists:
+        """The lists with the entries `kept` (P,)."""
+        columns, station = self.columns, self.station
+        message = np.repeat(np.arange(len(columns.rows)), columns.rows)[kept]
+        of_rows = {name: getattr(columns, name)[kept] for name in ("object_ix", "class_ix", "values")}
+        own = {n: getattr(self, n)[kept] for n in ("frame_code", "existence", "covariance_m2", "probability")}
+        columns = replace(columns, rows=np.bincount(message, minlength=len(columns.rows)), **of_rows)
+        station = station and replace(station, after_s=station.after_s[kept])
+        return replace(self, columns=columns, station=station, **own)
 
 
 def decode_lists(
@@ -496,8 +486,6 @@ class _BatchReader:
         described, objects = self._description, self._fields.objects
         if described.footprint is not None:
             fit_outlines(values, self._found, objects, self._wanted.path(described.footprint))
-        if (solid := described.solid) is not None:
-            fit_solids(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
         if described.largest_of is None:
             return meant
         chosen = find_largest(values, meant, self._found, objects, described.largest_of)
@@ -551,12 +539,11 @@ class _BatchReader:
 
     def _station(self, message: Int, keep: Int) -> Station | None:
         """The station of the messages (F,) and of the objects `keep` (K,)."""
-        fields = self._description.station
-        if fields is None:
+        if not self._description.station:
             return None
         of = self._found.levels[""]
-        place = [of.numbers[self._wanted.path(path)] for path in (fields.latitude_deg, fields.longitude_deg)]
-        return Station(np.stack(place, axis=1)[np.searchsorted(of.parent, message)], self.number(fields.after_s)[keep])
+        place = np.stack([of.numbers["latitude_deg"], of.numbers["longitude_deg"]], axis=1)
+        return Station(place[np.searchsorted(of.parent, message)], self.number("after_s")[keep])
 
     def _with_standing(
         self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float

@@ -7,41 +7,46 @@ Sources: ETSI TS 103 324 and TS 102 894-2 V2.1.1, as `etsi_its_cpm_ts_msgs` has 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from collections.abc import Callable, Collection
 from typing import Final
 
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float
-from copem_replay.io.schemas.description import ClassField, Description, Fields, Made, Stamp, StationFields
+from copem_replay.io.schemas.description import ClassField, Description, Fields, Made, Stamp
 
 _SIGMAS_95: Final = 1.959963984540054
 """Half the width of the interval that holds 95 % of a normal distribution, in standard deviations."""
 
 
-def _scale(per: float, *none: float) -> Callable[..., Float]:
-    """What makes numbers of whole ones, `per` of them one unit; NaN: one of `none`, or another column is 0."""
+def _scale(per: float, *none: float, flagged: bool = True) -> Callable[..., Float]:
+    """What makes numbers of whole ones, `per` of them one unit; NaN: one of `none`, or a flag is not as `flagged`."""
 
-    def make(whole: Float, *stated: Float) -> Float:
+    def make(whole: Float, *flags: Float) -> Float:
         known = ~np.isin(whole, none)
-        for column in stated:
-            known &= column != 0
+        for flag in flags:
+            known &= (flag != 0) == flagged
         return np.where(known, whole / per, np.nan)
 
     return make
 
 
-def _describe(objects: str, ident: str, within: str, class_: ClassField, made: Mapping[str, Made]) -> Description:
-    """The description of lists whose columns `made` has."""
+def _describe(objects: str, ident: str, within: str, class_: ClassField, made: dict[str, Made]) -> Description:
+    """The description of lists whose columns `made` has, with one path of the confidence along each axis."""
     names = ("x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "covariance")
     fields = {"objects": objects, "stamp": Stamp(path="stamp_ms", unit="ms"), "id": ident, "class": class_}
+    make_yaw, *of_yaw = made["yaw_rad"]
+    made |= {
+        "yaw_said": (lambda *of: np.isfinite(make_yaw(*of)), *of_yaw),
+        "yaw_rad": (lambda *of: np.nan_to_num(make_yaw(*of)), *of_yaw),
+        "covariance[1]": (np.zeros_like, made["covariance[0]"][1]),  # variances alone
+    }
     return Description(
         Fields.model_validate(fields | {name: name for name in names}),
         within=within,
         said={"yaw": "yaw_said"},
-        made={**made, "covariance[1]": Made((made["covariance[0]"].of[0],), np.zeros_like)},  # variances alone
-        station=StationFields("/latitude_deg", "/longitude_deg", "after_s"),
+        made=made,
+        station=True,
     )
 
 
@@ -51,22 +56,13 @@ _ITS_EPOCH_S: Final = 1_072_915_200
 """The begin of 2004 (UTC) in Unix time: times of ITS are counted from there."""
 _LEAPS_S: Final = (1_136_073_600, 1_230_768_000, 1_341_100_800, 1_435_708_800, 1_483_228_800)
 """Ends of the leap seconds since in Unix time, which does not count them; time of ITS does."""
-_OBJECTS = "payload.cpm_containers.value.array[].container_data_perceived_object_container.perceived_objects.array[]"
-_MANAGEMENT = "/payload.management_container"
-_VEHICLES = (
-    "vehicle", "pedestrian", "bicycle", "motorcycle", "motorcycle", "car", "bus", "van", "truck", "trailer", "vehicle",
-    "other", "bicycle", "animal", "vehicle",
-)  # fmt: skip
-"""TrafficParticipantType."""
-_PERSONS = ("pedestrian", "bicycle", "motorcycle", "animal")
-"""VruProfileAndSubprofile."""
 _CPM_CLASSES: Final = {
-    **{str(k): name for k, name in enumerate(_VEHICLES)},
-    **{str(1000 + k): name for k, name in enumerate(_PERSONS)},
-    **{"2000": "other", "3000": "other"},  # a group of road users, another thing
+    **dict(enumerate(("vehicle", "pedestrian", "bicycle", "motorcycle", "motorcycle", "car", "bus", "van", "truck"))),
+    **dict(enumerate(("trailer", "vehicle", "other", "bicycle", "animal", "vehicle"), 9)),
+    **dict(enumerate(("pedestrian", "bicycle", "motorcycle", "animal"), 1000)),
+    **{2000: "other", 3000: "other"},
 }
-_angle, _size = _scale(10, 3600, 3601), _scale(10, 0, 255, 256)
-_component, _spread = _scale(100, -16383, 16382, 16383), _scale(100, 0, 4095, 4096)
+"""TrafficParticipantType; 1000: VruProfileAndSubprofile; a group of road users, another thing."""
 
 
 def convert_its_time(its_ms: Float) -> Float:
@@ -75,70 +71,74 @@ def convert_its_time(its_ms: Float) -> Float:
     return its_ms + (_ITS_EPOCH_S - np.searchsorted(ends_ms, its_ms, side="right")) * 1000.0
 
 
-def _cpm_velocity(axis: int, stated: Float, kind: Float, speed: Float, direction: Float, along: Float) -> Float:
-    """A velocity along an axis: of a speed and its direction (`kind` 0), or along the axis."""
-    angle = np.deg2rad(_angle(direction))
-    polar = _scale(100, 16382, 16383)(speed) * (np.sin(angle) if axis else np.cos(angle))
-    return np.where(stated != 0, np.where(kind == 0, polar, _component(along)), np.nan)
+def _cpm_velocity(turn: Callable[[Float], Float]) -> Callable[..., Float]:
+    """What makes a velocity along an axis: of a speed and its direction (choice 0), or of that along the axis."""
+
+    def make(stated: Float, choice: Float, speed: Float, direction: Float, along: Float) -> Float:
+        polar = _scale(100, 16382, 16383)(speed) * turn(np.deg2rad(_scale(10, 3600, 3601)(direction)))
+        velocity = np.where(choice == 0, polar, _scale(100, -16383, 16382, 16383)(along))
+        return np.where(stated != 0, velocity, np.nan)
+
+    return make
 
 
-def _cpm_class(kind: Float, vehicle: Float, person: Float) -> Float:
-    return 1000 * kind + np.where(kind == 0, vehicle, np.where(kind == 1, person, 0))
+def _cpm_class(choice: Float, vehicle: Float, person: Float) -> Float:
+    return 1000 * choice + np.where(choice == 0, vehicle, np.where(choice == 1, person, 0))
 
 
 def cpm(offers: Collection[str]) -> Description:
     """CollectivePerceptionMessage: the objects of its containers, positions as east and north of the station."""
-    of_class, angle, polar = "classification.array[]", "angles.z_angle.value.value", "velocity.polar_velocity"
-    speed = (f"{polar}.velocity_magnitude.speed_value.value", f"{polar}.velocity_direction.value.value")
-    kinds = (
-        f"{of_class}.object_class.{name}" for name in ("choice", "vehicle_sub_class.value", "vru_sub_class.choice")
-    )
-    made = {
-        "/stamp_ms": Made((f"{_MANAGEMENT}.reference_time.value",), convert_its_time),
-        "after_s": Made(("measurement_delta_time.value",), _scale(1000)),
-        "yaw_said": Made((angle, "angles_is_present"), lambda *of: np.isfinite(_angle(*of))),
-        "yaw_rad": Made((angle, "angles_is_present"), lambda *of: np.deg2rad(np.nan_to_num(_angle(*of)))),
-        f"{of_class}.class": Made((*kinds,), _cpm_class),
-        f"{of_class}.share": Made(
-            (f"{of_class}.confidence.value",), lambda percent: np.where(percent > 100, 1.0, percent / 100)
+    management, of_class, speed = "/payload.management_container", "classification.array[]", "velocity.polar_velocity"
+    objects = "container_data_perceived_object_container.perceived_objects.array[]"
+    kind, along, angle = f"{of_class}.object_class", "velocity.cartesian_velocity", "angles.z_angle.value.value"
+    speed_of = (f"{speed}.velocity_magnitude.speed_value.value", f"{speed}.velocity_direction.value.value")
+    fast = ("velocity_is_present", "velocity.choice", *speed_of)
+    made: dict[str, Made] = {
+        "/stamp_ms": (convert_its_time, f"{management}.reference_time.value"),
+        "/latitude_deg": (_scale(1e7), f"{management}.reference_position.latitude.value"),
+        "/longitude_deg": (_scale(1e7), f"{management}.reference_position.longitude.value"),
+        "after_s": (_scale(1000), "measurement_delta_time.value"),
+        "yaw_rad": (lambda *of: np.deg2rad(_scale(10, 3600, 3601)(*of)), angle, "angles_is_present"),
+        "vx_mps": (_cpm_velocity(np.cos), *fast, f"{along}.x_velocity.value.value"),
+        "vy_mps": (_cpm_velocity(np.sin), *fast, f"{along}.y_velocity.value.value"),
+        f"{of_class}.class": (
+            _cpm_class, f"{kind}.choice", f"{kind}.vehicle_sub_class.value", f"{kind}.vru_sub_class.choice",
         ),
-    }
-    for k, (axis, side) in enumerate((("x", "length_m"), ("y", "width_m"), ("z", "height_m"))):
-        dimension, at = f"object_dimension_{axis}", f"position.{axis}_coordinate"
-        made[side] = Made((f"{dimension}.value.value", f"{dimension}_is_present"), _size)
-        if axis == "z":
-            continue
-        made[f"{axis}_m"] = Made((f"{at}.value.value",), _scale(100, -131072, 131071))
-        along = f"velocity.cartesian_velocity.{axis}_velocity.value.value"
-        made[f"v{axis}_mps"] = Made(
-            ("velocity_is_present", "velocity.choice", *speed, along), partial(_cpm_velocity, k)
-        )
-        made[f"covariance[{7 * k}]"] = Made((f"{at}.confidence.value",), lambda of: (_spread(of) / _SIGMAS_95) ** 2)
-    for name in ("latitude", "longitude"):
-        made[f"/{name}_deg"] = Made((f"{_MANAGEMENT}.reference_position.{name}.value",), _scale(1e7))
-    class_field = ClassField(path=f"{of_class}.class", map=_CPM_CLASSES, probability=f"{of_class}.share")
-    return _describe(_OBJECTS, "object_id.value", "/header.station_id.value", class_field, made)
+        f"{of_class}.share": (lambda of: np.where(of > 100, 1.0, of / 100), f"{of_class}.confidence.value"),
+    }  # fmt: skip
+    for place, axis in {0: "x", 7: "y"}.items():
+        at = f"position.{axis}_coordinate"
+        made[f"{axis}_m"] = (_scale(100, -131072, 131071), f"{at}.value.value")
+        made[f"covariance[{place}]"] = (
+            lambda of: (_scale(100, 0, 4095, 4096)(of) / _SIGMAS_95) ** 2, f"{at}.confidence.value",
+        )  # fmt: skip
+    for side, axis in {"length": "x", "width": "y", "height": "z"}.items():
+        size = f"object_dimension_{axis}"
+        made[f"{side}_m"] = (_scale(10, 0, 255, 256), f"{size}.value.value", f"{size}_is_present")
+    names = {str(number): name for number, name in _CPM_CLASSES.items()}
+    class_field = ClassField(path=f"{of_class}.class", map=names, probability=f"{of_class}.share")
+    objects = f"payload.cpm_containers.value.array[].{objects}"
+    return _describe(objects, "object_id.value", "/header.station_id.value", class_field, made)
 
 
 # SDSM.
 
-_COMMON, _OPTIONAL = "detected_object_common_data", "detected_object_optional_data"
 _NEAR_M = np.array([np.nan, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01])
 """PositionConfidence: as near is a position, along each axis, with 95 %."""
 _SDSM_CLASSES: Final = {
-    **{"0": "other", "1": "vehicle", "2": "pedestrian", "3": "animal"},  # ObjectType, where it says no more
-    **{"1010": "car", "1011": "car", "1020": "van", "1021": "van"},
-    **{str(1000 + k): "truck" for k in range(25, 36)},
-    **{str(1000 + k): "motorcycle" for k in range(40, 49)},
-    **{str(1000 + k): "bus" for k in range(50, 59)},
-    **{str(1000 + k): "vehicle" for k in (1, *range(60, 70))},
-    **{"2001": "pedestrian", "2002": "bicycle", "2003": "pedestrian", "2004": "animal"},
+    **dict(enumerate(("other", "vehicle", "pedestrian", "animal"))),  # ObjectType, where it says no more
+    **{1010: "car", 1011: "car", 1020: "van", 1021: "van"},
+    **dict.fromkeys(range(1025, 1036), "truck"),
+    **dict.fromkeys(range(1040, 1049), "motorcycle"),
+    **dict.fromkeys(range(1050, 1059), "bus"),
+    **dict.fromkeys((1001, *range(1060, 1070)), "vehicle"),
+    **dict(enumerate(("pedestrian", "bicycle", "pedestrian", "animal"), 2001)),
 }
 """1000: BasicVehicleClass; 2000: PersonalDeviceUserType."""
-_HAS_SIZE, _HAS_HEIGHT, _HAS_CLASS, _HAS_TIME, _HAS_ZONE = 32, 64, 256, 63, 64
-"""Bits of presence: of the size, height and class of a vehicle; of all parts of a time, and of its zone."""
 _VEHICLE, _PERSON, _OBSTACLE = 0, 1, 2
 _TIME = ("presence_vector", "year.year", "month.month", "day.day", "hour.hour", "minute.minute", "second.millisecond")
+_HAS_TIME, _HAS_ZONE, _HAS_SIZE, _HAS_HEIGHT, _HAS_CLASS = 63, 64, 32, 64, 256
+"""Bits of presence: of all parts of a time, and its zone; of the size, height and class of a vehicle."""
 
 
 def _has(flags: Float, bits: int) -> Bool:
@@ -176,67 +176,62 @@ def _sdsm_size(bit: int, per: float, per_obstacle: float) -> Callable[..., Float
 
 
 def sdsm(offers: Collection[str]) -> Description:
-    """SensorDataSharingMessage in m, s and degrees."""
-    return _describe_sdsm(dict.fromkeys(("place", "time", "at", "speed", "angle", "side", "height", "obstacle"), 1))
+    """SensorDataSharingMessage in m, s and degrees, with flags for what is unavailable."""
+    return _describe_sdsm(1, 1, 1, 1, 1, 1, 1, "unavailable")
 
 
 def sdsm_integers(offers: Collection[str]) -> Description:
     """SensorDataSharingMessage in the units of J3224."""
-    per = {"place": 1e7, "time": 1000, "at": 10, "speed": 50, "angle": 80, "side": 100, "height": 20, "obstacle": 10}
-    return _describe_sdsm(per)
+    return _describe_sdsm(1e7, 1000, 10, 50, 80, 100, 20)
 
 
-def _describe_sdsm(per: Mapping[str, float]) -> Description:
-    """The description of messages with so many units for each m, s or degree.
+def _describe_sdsm(
+    per_deg: float, per_s: float, per_m: float, per_mps: float, per_turn: float, per_side: float, per_height: float,
+    *flags: str,
+) -> Description:  # fmt: skip
+    """The description of messages with so many units for a degree of the place, an s, an m, an m/s, a degree of the
+    heading, an m of the side of a vehicle and of its height.
 
-    Offsets are north and east of the station, as CARMA reads them. The time of a measurement is before the message's,
-    whatever its sign: writers differ.
+    Offsets are north and east of the station, as CARMA reads them. A measurement is before its message, whatever the
+    sign of its time: writers differ.
     """
-    flags = () if per["speed"] > 1 else ("unavailable",)
-    angle, speed = _scale(per["angle"], 28800), _scale(per["speed"], 8191)
-    heading, fast = (
-        (f"{_COMMON}.{name}.{name}", *(f"{_COMMON}.{name}.{flag}" for flag in flags)) for name in ("heading", "speed")
-    )
+    common, optional = "detected_object_common_data", "detected_object_optional_data"
+    vehicle, person, obstacle = (f"{optional}.{name}" for name in ("det_veh", "det_vru", "det_obst"))
+    heading, speed = ([f"{common}.{name}.{of}" for of in (name, *flags)] for name in ("heading", "speed"))
+    fast, turn = _scale(per_mps, 8191, flagged=False), _scale(per_turn, 28800, flagged=False)
+    has, count = ("presence_vector", f"{optional}.choice"), len(speed)
 
-    def yaw(heading: Float, *unknown: Float) -> Float:
-        return np.where(np.any([flag != 0 for flag in unknown], axis=0), np.nan, np.deg2rad(90 - angle(heading)))
+    def yaw(*of: Float) -> Float:
+        return np.deg2rad(90 - turn(*of))
 
-    def velocity(turn: Callable[[Float], Float]) -> Callable[..., Float]:
-        def make(*of: Float) -> Float:
-            to, (value, *unknown) = yaw(*of[: len(heading)]), of[len(heading) :]
-            return np.where(np.any([flag != 0 for flag in unknown], axis=0), np.nan, speed(value)) * turn(to)
+    def variance(of: Float) -> Float:
+        return np.square(_NEAR_M[np.where(of < len(_NEAR_M), of, 0).astype(np.int64)] / _SIGMAS_95)
 
-        return make
-
-    has, person = ("presence_vector", f"{_OPTIONAL}.choice"), f"{_OPTIONAL}.det_vru"
-    vehicle, obstacle = f"{_OPTIONAL}.det_veh", f"{_OPTIONAL}.det_obst"
-    which = (f"{vehicle}.vehicle_class.basic_vehicle_class", f"{person}.basic_type.type")
-    made = {
-        "/stamp_ms": Made(tuple(f"/sdsm_time_stamp.{part}" for part in (*_TIME, "offset.offset_minute")), _sdsm_time),
-        "after_s": Made((f"{_COMMON}.measurement_time.measurement_time_offset",), lambda of: -np.abs(of) / per["time"]),
-        "x_m": Made((f"{_COMMON}.pos.offset_y.object_distance",), _scale(per["at"])),
-        "y_m": Made((f"{_COMMON}.pos.offset_x.object_distance",), _scale(per["at"])),
-        "yaw_said": Made(heading, lambda *of: np.isfinite(yaw(*of))),
-        "yaw_rad": Made(heading, lambda *of: np.nan_to_num(yaw(*of))),
-        "vx_mps": Made((*heading, *fast), velocity(np.cos)),
-        "vy_mps": Made((*heading, *fast), velocity(np.sin)),
-        "class": Made(
-            (f"{_COMMON}.obj_type.object_type", *has, *(f"{of}.presence_vector" for of in (vehicle, person)), *which),
-            _sdsm_class,
+    made: dict[str, Made] = {
+        "/stamp_ms": (_sdsm_time, *(f"/sdsm_time_stamp.{part}" for part in (*_TIME, "offset.offset_minute"))),
+        "/latitude_deg": (_scale(per_deg), "/ref_pos.latitude"),
+        "/longitude_deg": (_scale(per_deg), "/ref_pos.longitude"),
+        "after_s": (lambda of: -np.abs(of) / per_s, f"{common}.measurement_time.measurement_time_offset"),
+        "x_m": (_scale(per_m), f"{common}.pos.offset_y.object_distance"),
+        "y_m": (_scale(per_m), f"{common}.pos.offset_x.object_distance"),
+        "yaw_rad": (yaw, *heading),
+        "vx_mps": (lambda *of: fast(*of[:count]) * np.cos(yaw(*of[count:])), *speed, *heading),
+        "vy_mps": (lambda *of: fast(*of[:count]) * np.sin(yaw(*of[count:])), *speed, *heading),
+        "covariance[0]": (variance, f"{common}.pos_confidence.pos.confidence"),
+        "covariance[7]": (variance, f"{common}.pos_confidence.pos.confidence"),
+        "class": (
+            _sdsm_class, f"{common}.obj_type.object_type", *has, f"{vehicle}.presence_vector",
+            f"{person}.presence_vector", f"{vehicle}.vehicle_class.basic_vehicle_class", f"{person}.basic_type.type",
         ),
-        "/latitude_deg": Made(("/ref_pos.latitude",), _scale(per["place"])),
-        "/longitude_deg": Made(("/ref_pos.longitude",), _scale(per["place"])),
     }  # fmt: skip
-    sides = {"length": ("size.vehicle_length", _HAS_SIZE, "side"), "width": ("size.vehicle_width", _HAS_SIZE, "side")}
-    for side, (path, bit, unit) in (sides | {"height": ("height.vehicle_height", _HAS_HEIGHT, "height")}).items():
-        of = (*has, f"{vehicle}.presence_vector", f"{vehicle}.{path}", f"{obstacle}.obst_size.{side}.size_value")
-        made[f"{side}_m"] = Made(of, _sdsm_size(bit, per[unit], per["obstacle"]))
-    for k in (0, 7):
-        made[f"covariance[{k}]"] = Made(
-            (f"{_COMMON}.pos_confidence.pos.confidence",),
-            lambda of: (_NEAR_M[np.where(of < len(_NEAR_M), of, 0).astype(np.int64)] / _SIGMAS_95) ** 2,
-        )
-    class_field = ClassField(path="class", map=_SDSM_CLASSES)
+    for side, (of, bit, per) in {
+        "length": ("size.vehicle_length", _HAS_SIZE, per_side),
+        "width": ("size.vehicle_width", _HAS_SIZE, per_side),
+        "height": ("height.vehicle_height", _HAS_HEIGHT, per_height),
+    }.items():
+        paths = (f"{vehicle}.presence_vector", f"{vehicle}.{of}", f"{obstacle}.obst_size.{side}.size_value")
+        made[f"{side}_m"] = (_sdsm_size(bit, per, per_m), *has, *paths)
+    class_field = ClassField(path="class", map={str(number): name for number, name in _SDSM_CLASSES.items()})
     return _describe(
-        "objects.detected_object_data[]", f"{_COMMON}.detected_id.object_id", "/source_id.id", class_field, made
+        "objects.detected_object_data[]", f"{common}.detected_id.object_id", "/source_id.id", class_field, made
     )
