@@ -45,6 +45,7 @@ from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
 from copem_replay.io.findings import find_rule
 from copem_replay.io.open import (
+    DriveRecordings,
     File,
     Local,
     Place,
@@ -370,6 +371,9 @@ def _read_recording(experiment: Experiment, place: Place) -> tuple[Recording | N
 
 def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recording | None, list[RefusedLog]]:
     path = place if isinstance(place, Path) else place.paths[0]
+    if experiment.read.definitions is not None:
+        place = DriveRecordings((place,), (0.0,)) if isinstance(place, Path) else place
+        place = replace(place, definitions=experiment.read.definitions)
     try:
         str(resolve_place(path)).encode()
     except UnicodeEncodeError:

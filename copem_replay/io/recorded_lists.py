@@ -52,6 +52,8 @@ from copem_replay.io.stamps import refuse_second_run, settle_stamps
 from copem_replay.io.stations import place_on_earth, settle_measurements
 from copem_replay.io.window import Window
 
+Details = Mapping[int, Mapping[str, Any]]
+"""What `…/detail` says beside lists, by the time in ns at which each was available."""
 _LARGEST_ID = 2**63 - 1
 """OSI's identifiers are unsigned: the highest bit of larger ones is dropped, so that they fit signed integers."""
 
@@ -422,13 +424,11 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
     lists = read_decoded_lists(log, same_schema, None, around.classes)
     if lists.station is not None:
         lists = place_on_earth(lists, lists.station, scene.frame, log.path, topic)
-        settled = settle_measurements(lists, scene.t0_ns, log.path, topic)
-        return _make_recorded_lists(*settled, {}, log.path, topic, scene)
-    lists = transform_to_world(lists, around, log.path, topic)
-    details = _read_details(log, topic)
-    return _make_recorded_lists(
-        lists, *_find_captures(lists.columns.stamp_ns, details), details, log.path, topic, scene
-    )
+        lists, captures = settle_measurements(lists, scene.t0_ns, log.path, topic)
+        return _make_recorded_lists(lists, captures, {}, log.path, topic, scene)
+    lists, details = transform_to_world(lists, around, log.path, topic), _read_details(log, topic)
+    captures = _find_captures(lists.columns.stamp_ns, details)
+    return _make_recorded_lists(lists, captures, details, log.path, topic, scene)
 
 
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
@@ -451,7 +451,7 @@ def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
     return details
 
 
-def _find_captures(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[Int, Bool]:
+def _find_captures(stamps: Int, details: Details) -> tuple[Int, Bool]:
     """(F,) captures of the lists available at `stamps`, and whether `details` state them; else the stamp itself."""
     captured, stated = stamps.copy(), np.zeros(len(stamps), dtype=bool)
     for k, stamp in enumerate(stamps.tolist()):
@@ -461,7 +461,7 @@ def _find_captures(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tup
     return captured, stated
 
 
-def _add_details(lists: DecodedLists, details: Mapping[int, Mapping[str, Any]]) -> tuple[DecodedLists, Float]:
+def _add_details(lists: DecodedLists, details: Details) -> tuple[DecodedLists, Float]:
     """The lists with sizes and existence of `details`, and (P, uncertainties) their variances, NaN: not stated."""
     columns = lists.columns
     values, existence = columns.values.copy(), lists.existence.copy()
@@ -485,14 +485,10 @@ def _get_number(item: Any, name: str, otherwise: float) -> float:
 
 
 def _make_recorded_lists(
-    lists: DecodedLists,
-    captured: Int,
-    capture_said: Bool,
-    details: Mapping[int, Mapping[str, Any]],
-    path: Path,
-    topic: str,
-    scene: Scene,
+    lists: DecodedLists, captures: tuple[Int, Bool], details: Details, path: Path, topic: str, scene: Scene
 ) -> RecordedLists:
+    """The lists as tracks, with their captures, and whether these are stated."""
+    captured, capture_said = captures
     lists, variances = _add_details(lists, details)
     columns, findings = lists.columns, list[str]()
     turned = ~np.isnan(lists.covariance_m2).all(axis=1)

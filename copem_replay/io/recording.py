@@ -324,7 +324,8 @@ def _describe_ignored(
         has_messages = channel.messages and channel.number not in poses
         # A topic of the truth may hold messages of another schema, too.
         of_topic = is_truth(channel) or channel.schema == topics.get(channel.topic)
-        if has_messages and not (channel.topic in topics and of_topic) and channel.topic not in beside:
+        beside_it = channel.topic in beside or channel.schema == osi.EMBEDDED_MAP
+        if has_messages and not (channel.topic in topics and of_topic) and not beside_it:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{count_noun(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 

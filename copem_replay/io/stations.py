@@ -60,7 +60,9 @@ def _take_messages(lists: DecodedLists, kept: Bool) -> DecodedLists:
     return replace(lists, columns=take_messages(lists.columns, kept))
 
 
-def settle_measurements(lists: DecodedLists, t0_ns: int, path: Path, topic: str) -> tuple[DecodedLists, Int, Bool]:
+def settle_measurements(
+    lists: DecodedLists, t0_ns: int, path: Path, topic: str
+) -> tuple[DecodedLists, tuple[Int, Bool]]:
     """The lists of stations with their objects at one capture each, (F,) captures, and whether these are stated.
 
     Stamps are arrivals then. Where the stations' clock is not that of the times of logging, these are taken: captures
@@ -86,4 +88,4 @@ def settle_measurements(lists: DecodedLists, t0_ns: int, path: Path, topic: str)
         raise RecordingError(f"{older}, the last one by {before_s:.3g} s", path=path, topic=topic)
     notes += find("older", int((~kept).sum()))
     arrived = replace(columns, values=values, stamp_ns=columns.log_time_ns, notes=tuple(notes))
-    return _take_messages(replace(lists, columns=arrived), kept), captured_ns[kept], said[kept]
+    return _take_messages(replace(lists, columns=arrived), kept), (captured_ns[kept], said[kept])

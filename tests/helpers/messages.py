@@ -1,6 +1,7 @@
 """Messages for the tests of formats: ROS 2 ones serialised by rosbags, and what was read of them in short."""
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,16 @@ def defined(text: str, name: str = "p/msg/A", encoding: str = "ros2msg") -> CdrD
     return CdrDefinition(name, encoding, text.encode())
 
 
-def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
-    """By rosbags; fields that the message lacks are 0, or empty."""
+@cache
+def store_of(text: str, name: str) -> Any:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, name))
+    return store
+
+
+def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
+    """By rosbags; fields that the message lacks are 0, or empty."""
+    store = store_of(text, name)
 
     def made(name: str, value: dict[str, Any]) -> Any:
         fields = store.get_msgdef(name).fields

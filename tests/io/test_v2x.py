@@ -17,6 +17,7 @@ from copem_replay.core.frame import Frame, make_local_proj
 from copem_replay.core.tracks import CLASSES
 from copem_replay.core.yaml import dump_yaml
 from copem_replay.io.encodings.cdr import CdrDefinition
+from copem_replay.io.open import DriveRecordings, open_log
 from copem_replay.io.recorded_lists import RecordedLists, read_unit_lists
 from copem_replay.io.recording import read_log
 from copem_replay.io.schemas.object_lists import DecodedLists, decode_lists
@@ -344,3 +345,85 @@ def test_a_cpm_is_no_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
         monkeypatch,
     )
     assert "its positions are relative to stations; lists of a unit they can be" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------ definitions
+
+
+@pytest.fixture
+def silent(tmp_path: Path) -> Path:
+    """A recording whose recorder lacked the package of CPM."""
+    path = drive(tmp_path / "a.mcap", *(seen(t / 10) for t in range(5, 15)))
+    truth = next(iter(open_log(path).channels))
+    topic = replace(topic_of(*(seen(t / 10) for t in range(5, 15))), definition=("ros2msg", b""))
+    messages = [(t, data) for _, t, data in open_log(path).payloads(frozenset({truth.number}))]
+    osi = Topic(truth.topic, truth.schema, messages, definition=("protobuf", truth.schema_data))
+    return write_mcap(tmp_path / "silent.mcap", [osi, topic])
+
+
+def write_package(folder: Path) -> Path:
+    """The package of CPM, a file for each type."""
+    (folder / "etsi_its_cpm_ts_msgs" / "msg").mkdir(parents=True)
+    first, *others = CPM_TEXT.split("=" * 80 + "\n")
+    for text in (f"MSG: p/CollectivePerceptionMessage\n{first}", *others):
+        name, _, fields = text.partition("\n")
+        (folder / "etsi_its_cpm_ts_msgs" / "msg" / f"{name.rpartition('/')[2]}.msg").write_text(fields)
+    return folder
+
+
+PLAN = """\
+version: 1
+logs: [silent.mcap]
+read: {definitions: DEFINITIONS}
+frame: {proj: {at_wgs84: [48.0, 11.0]}}
+units: {rsu: {recorded: {topic: cpm}, at: [0, 0]}}
+configurations: {GT: {units: truth}, one: {units: [rsu], fusion: {kind: gnn}}}
+measure: {onset: {kind: appears}, began: [log_start, appeared]}
+show: {run: 0}
+"""
+
+
+def test_definitions_are_read_from_a_folder(silent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_package(silent.parent / "ws")
+    monkeypatch.chdir(silent.parent)
+    Path("experiment.yaml").write_text(PLAN.replace("DEFINITIONS", "ws"))
+    monkeypatch.setattr("sys.argv", ["copem-replay", "run", "experiment.yaml"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    copied = next(c for c in open_log(Path("out/experiment/replay.mcap")).channels if c.topic == "cpm")
+    assert b"ManagementContainer management_container" in copied.schema_data  # the copy can be read without it
+    found = lists_of(silent.parent / "a.mcap")
+    here = DriveRecordings((silent,), (0.0,), definitions=str(folder))
+    again = read_unit_lists(here, "cpm", replace(read_log(here, name="log").scene, frame=HERE), None)
+    assert again.tracks.y_m.tolist() == found.tracks.y_m.tolist()
+
+
+@pytest.mark.parametrize(
+    ("files", "line"),
+    [
+        ({}, "/ws: expected definitions of messages in a folder, `package/msg/Type.msg`, found none ("),
+        ({"p/msg/A.msg": "uint8 uint8 uint8\n%"}, "A.msg: expected definitions of messages in a folder, "
+         "`package/msg/Type.msg`, found none ("),
+        ({"etsi_its_cpm_ts_msgs/msg/CollectivePerceptionMessage.msg": "Lost header"}, "found none ("),
+    ],
+)  # fmt: skip
+def test_a_folder_without_definitions_is_one_line(
+    silent: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], files: dict[str, str], line: str
+) -> None:
+    for name, text in files.items():
+        path = silent.parent / "ws" / name
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+    monkeypatch.chdir(silent.parent)
+    check(silent.parent, PLAN.replace("DEFINITIONS", "ws"), monkeypatch)
+    (told,) = capsys.readouterr().err.strip().splitlines()
+    assert line in told
+
+
+def test_without_a_folder_the_line_names_the_key(
+    silent: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(silent.parent)
+    check(silent.parent, PLAN.replace("read: {definitions: DEFINITIONS}\n", ""), monkeypatch)
+    assert "`read: {definitions: FOLDER}` names a folder that has it" in capsys.readouterr().err

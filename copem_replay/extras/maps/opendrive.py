@@ -20,6 +20,10 @@ from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_a
 from copem_replay.core.tracks import Area, Float
 from copem_replay.extras.convert.commonroad import XmlNode, read_parts
 from copem_replay.extras.maps.opendrive_geometry import CHORD_M, SHAPES, Cubics, Piece, RoadLine
+from copem_replay.io.encodings import make_definition
+from copem_replay.io.encodings.columns import shred_messages
+from copem_replay.io.open import open_log
+from copem_replay.io.schemas.osi_ground_truth import EMBEDDED_MAP
 
 _FARTHEST: Final = 1e8
 """No number of a map is larger: metres of projections are below 2e7."""
@@ -82,11 +86,30 @@ class _Reading:
             )
 
 
-def read_opendrive(path: Path, _heights_m: Mapping[str, float] | None = None, *, chord_m: float = CHORD_M) -> SiteMap:
-    """Lanes, areas and solids of a map. Raises InputError with file and line."""
+def read_embedded_map(path: Path, _heights_m: Mapping[str, float] | None = None) -> SiteMap:
+    """The map that a recording has in it, as omega-prime writes it. Raises InputError, with the line of the map."""
+    log, name = open_log(path), "open_drive_xml_content"
+    maps = {c.number: c for c in log.channels if c.schema == EMBEDDED_MAP and c.messages}
+    if not maps:
+        raise InputError(f"{path}: expected a map in the recording ({EMBEDDED_MAP}), found none")
+    number, _, payload = next(log.payloads(frozenset(maps)))
+    words = (
+        shred_messages(make_definition(maps[number], [payload]), [payload], texts=[name]).levels[""].texts[name].words
+    )
+    return read_opendrive(path, content="".join(words).encode())
+
+
+def read_opendrive(
+    path: Path,
+    _heights_m: Mapping[str, float] | None = None,
+    *,
+    chord_m: float = CHORD_M,
+    content: bytes | None = None,
+) -> SiteMap:
+    """Lanes, areas and solids of a map; `content`: of the file, None: it is read. Raises InputError with the line."""
     reading = _Reading(path)
     proj, offset_m, yaw_rad = "", (0.0, 0.0), 0.0
-    for part in read_parts(path, ("OpenDRIVE",), most_elements=300_000):
+    for part in read_parts(path, ("OpenDRIVE",), most_elements=300_000, content=content):
         if part.tag == "header":
             reference = part.find("geoReference")
             proj = "" if reference is None else reference.text.strip()

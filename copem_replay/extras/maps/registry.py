@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import SiteMap
 from copem_replay.experiment.maps import DEFAULT_HEIGHTS_M
+from copem_replay.io.containers.mcap_records import MAGIC
 
 _LANELET: Final = re.compile(rb"""v\s*=\s*["']lanelet["']""")
 
@@ -40,6 +41,9 @@ def _is_geojson(file: _Candidate) -> bool:
 
 FORMATS: Final[dict[str, tuple[Callable[[_Candidate], bool], str]]] = {
     "OpenDRIVE": (lambda file: b"<OpenDRIVE" in file.head, "copem_replay.extras.maps.opendrive:read_opendrive"),
+    "OpenDRIVE in a recording": (
+        lambda file: file.head.startswith(MAGIC), "copem_replay.extras.maps.opendrive:read_embedded_map",
+    ),
     "Lanelet2": (
         lambda file: b"<osm" in file.head and file.has_lanelets(), "copem_replay.extras.maps.lanelet2:read_lanelet2",
     ),

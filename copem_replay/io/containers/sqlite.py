@@ -19,7 +19,7 @@ from copem_replay.io.window import is_kept
 if TYPE_CHECKING:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-_FORMATS: Final = {"NONE": "", "MSG": "ros2msg", "IDL": "ros2idl"}
+_FORMATS: Final = {"NONE": "ros2msg", "MSG": "ros2msg", "IDL": "ros2idl"}
 _LAST_NS: Final = 2**63 - 2
 """The largest time that SQLite holds, less what its reader adds."""
 

@@ -22,14 +22,8 @@ from copem_replay.io.schemas.description import (
 )
 
 # ObjectClassification.msg of both packages, the same up to PEDESTRIAN; from HAZARD on it is no road user
-_AUTOWARE = {
-    "1": "car",
-    "2": "truck",
-    "3": "bus",
-    "4": "trailer",
-    "5": "motorcycle",
-    "6": "bicycle",
-    "7": "pedestrian",
+AUTOWARE = {
+    **{"1": "car", "2": "truck", "3": "bus", "4": "trailer", "5": "motorcycle", "6": "bicycle", "7": "pedestrian"},
     "8": "animal",
 }
 
@@ -40,14 +34,7 @@ _AUTOWARE_SAYS: Mapping[Literal["yaw", "velocity", "covariance"], str] = {
 }
 
 # derived_object_msgs/Object.msg
-_DERIVED = {
-    "4": "pedestrian",
-    "5": "bicycle",
-    "6": "car",
-    "7": "truck",
-    "8": "motorcycle",
-    "9": "vehicle",
-}
+_DERIVED = {"4": "pedestrian", "5": "bicycle", "6": "car", "7": "truck", "8": "motorcycle", "9": "vehicle"}
 
 # perception_msgs/ObjectClassification.msg
 _IKA = {
@@ -55,6 +42,9 @@ _IKA = {
     **{"8": "animal", "9": "other", "10": "other", "11": "trailer", "12": "pedestrian", "13": "bicycle"},
     **{"50": "car", "51": "truck", "52": "bicycle", "100": "other"},
 }
+
+
+_LIST = {"objects": "objects[]", "stamp": "header.stamp", "frame": "header.frame_id"}
 
 
 def _box(pose: str, size: str) -> dict[str, Any]:
@@ -74,13 +64,11 @@ def autoware(offers: Collection[str]) -> Description:
     return Description(
         Fields.model_validate(
             {
-                "objects": "objects[]",
-                "stamp": "header.stamp",
-                "frame": "header.frame_id",
+                **_LIST,
                 "id": "object_id.uuid" if "objects[].object_id.uuid" in offers else None,
                 "class": {
                     "path": "classification[].label",
-                    "map": _AUTOWARE,
+                    "map": AUTOWARE,
                     "probability": "classification[].probability",
                 },
                 **_box(f"{pose}.pose", "shape.dimensions"),
@@ -102,9 +90,8 @@ def detection3d(offers: Collection[str]) -> Description:
     kind, score = ("hypothesis.class_id", "hypothesis.score") if new else ("id", "score")
     ident = next((n for n in ("id", "tracking_id") if f"detections[].{n}" in offers), None)
     fields = {
+        **_LIST,
         "objects": "detections[]",
-        "stamp": "header.stamp",
-        "frame": "header.frame_id",
         "id": ident,
         "class": {"path": f"results[].{kind}", "probability": f"results[].{score}"},
         "existence": f"results[0].{score}",
@@ -132,9 +119,7 @@ def derived(offers: Collection[str]) -> Description:
     made: dict[str, Made] = {f"box[{k}]": (_solid(k), "shape.type", *sides) for k in range(3)}
     made, sides = (made, [*made]) if "objects[].shape.type" in offers else ({}, sides)
     fields = {
-        "objects": "objects[]",
-        "stamp": "header.stamp",
-        "frame": "header.frame_id",
+        **_LIST,
         "id": "id",
         "class": ClassField(path="classification", map=_DERIVED),
         **_box("pose", "shape"),
@@ -199,9 +184,7 @@ def perception(offers: Collection[str]) -> Description:
     }
     kinds = "state.classifications[]"
     fields = {
-        "objects": "objects[]",
-        "stamp": "header.stamp",
-        "frame": "header.frame_id",
+        **_LIST,
         "id": "id",
         "class": {"path": f"{kinds}.type", "map": _IKA, "probability": f"{kinds}.probability"},
         "vx_mps": f"{place}[3]",

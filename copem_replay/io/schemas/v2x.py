@@ -31,23 +31,21 @@ def _scale(per: float, *none: float, flagged: bool = True) -> Callable[..., Floa
     return make
 
 
-def _describe(objects: str, ident: str, within: str, class_: ClassField, made: dict[str, Made]) -> Description:
+def _describe(
+    objects: str, ident: str, within: str, class_: str, names: dict[int, str], share: str | None, made: dict[str, Made]
+) -> Description:
     """The description of lists whose columns `made` has, with one path of the confidence along each axis."""
-    names = ("x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "covariance")
-    fields = {"objects": objects, "stamp": Stamp(path="stamp_ms", unit="ms"), "id": ident, "class": class_}
+    columns = ("x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "covariance")
+    kind = ClassField(path=class_, map={str(number): name for number, name in names.items()}, probability=share)
+    fields = {"objects": objects, "stamp": Stamp(path="stamp_ms", unit="ms"), "id": ident, "class": kind}
     make_yaw, *of_yaw = made["yaw_rad"]
     made |= {
         "yaw_said": (lambda *of: np.isfinite(make_yaw(*of)), *of_yaw),
         "yaw_rad": (lambda *of: np.nan_to_num(make_yaw(*of)), *of_yaw),
         "covariance[1]": (np.zeros_like, made["covariance[0]"][1]),  # variances alone
     }
-    return Description(
-        Fields.model_validate(fields | {name: name for name in names}),
-        within=within,
-        said={"yaw": "yaw_said"},
-        made=made,
-        station=True,
-    )
+    fields |= {name: name for name in columns}
+    return Description(Fields.model_validate(fields), within=within, said={"yaw": "yaw_said"}, made=made, station=True)
 
 
 # CPM.
@@ -89,7 +87,8 @@ def _cpm_class(choice: Float, vehicle: Float, person: Float) -> Float:
 def cpm(offers: Collection[str]) -> Description:
     """CollectivePerceptionMessage: the objects of its containers, positions as east and north of the station."""
     management, of_class, speed = "/payload.management_container", "classification.array[]", "velocity.polar_velocity"
-    objects = "container_data_perceived_object_container.perceived_objects.array[]"
+    objects = "perceived_object_container.perceived_objects.array[]"
+    objects = f"payload.cpm_containers.value.array[].container_data_{objects}"
     kind, along, angle = f"{of_class}.object_class", "velocity.cartesian_velocity", "angles.z_angle.value.value"
     speed_of = (f"{speed}.velocity_magnitude.speed_value.value", f"{speed}.velocity_direction.value.value")
     fast = ("velocity_is_present", "velocity.choice", *speed_of)
@@ -115,10 +114,8 @@ def cpm(offers: Collection[str]) -> Description:
     for side, axis in {"length": "x", "width": "y", "height": "z"}.items():
         size = f"object_dimension_{axis}"
         made[f"{side}_m"] = (_scale(10, 0, 255, 256), f"{size}.value.value", f"{size}_is_present")
-    names = {str(number): name for number, name in _CPM_CLASSES.items()}
-    class_field = ClassField(path=f"{of_class}.class", map=names, probability=f"{of_class}.share")
-    objects = f"payload.cpm_containers.value.array[].{objects}"
-    return _describe(objects, "object_id.value", "/header.station_id.value", class_field, made)
+    path, share = f"{of_class}.class", f"{of_class}.share"
+    return _describe(objects, "object_id.value", "/header.station_id.value", path, _CPM_CLASSES, share, made)
 
 
 # SDSM.
@@ -224,14 +221,12 @@ def _describe_sdsm(
             f"{person}.presence_vector", f"{vehicle}.vehicle_class.basic_vehicle_class", f"{person}.basic_type.type",
         ),
     }  # fmt: skip
-    for side, (of, bit, per) in {
-        "length": ("size.vehicle_length", _HAS_SIZE, per_side),
-        "width": ("size.vehicle_width", _HAS_SIZE, per_side),
-        "height": ("height.vehicle_height", _HAS_HEIGHT, per_height),
-    }.items():
+    for side, of, bit, per in (
+        ("length", "size.vehicle_length", _HAS_SIZE, per_side),
+        ("width", "size.vehicle_width", _HAS_SIZE, per_side),
+        ("height", "height.vehicle_height", _HAS_HEIGHT, per_height),
+    ):
         paths = (f"{vehicle}.presence_vector", f"{vehicle}.{of}", f"{obstacle}.obst_size.{side}.size_value")
         made[f"{side}_m"] = (_sdsm_size(bit, per, per_m), *has, *paths)
-    class_field = ClassField(path="class", map={str(number): name for number, name in _SDSM_CLASSES.items()})
-    return _describe(
-        "objects.detected_object_data[]", f"{common}.detected_id.object_id", "/source_id.id", class_field, made
-    )
+    ident, objects = f"{common}.detected_id.object_id", "objects.detected_object_data[]"
+    return _describe(objects, ident, "/source_id.id", "class", _SDSM_CLASSES, None, made)
