@@ -89,6 +89,7 @@ RULES: Final = {
     "again": Rule("message", "with the time stamp of another: the first kept"),
     # Lists of stations.
     "no station": Rule("message", "without the reference position of its station: skipped"),
+    "stations": Rule("station", "beside the first sends on this topic: all are taken as one unit"),
     "older": Rule("message", "captured more than a second before the log begins: skipped"),
     "station clock": Rule(
         "message",

@@ -24,7 +24,7 @@ from copem_replay.core.errors import RecordingError, RemoteFile
 from copem_replay.io.channel import Channel
 from copem_replay.io.containers.osi_trace import is_trace, open_trace
 from copem_replay.io.containers.rosbag2 import METADATA, list_bag_files, merge_streams, open_bag
-from copem_replay.io.containers.sqlite import is_sqlite, open_sqlite
+from copem_replay.io.containers.sqlite import DB3, open_sqlite
 from copem_replay.io.encodings.ros2_types import define_channels
 from copem_replay.io.log import BrokenIndexError, Log, open_file, open_mcap
 from copem_replay.io.window import ALWAYS, Window
@@ -307,7 +307,7 @@ def find_drive_recordings(log: Log) -> DriveRecordings | None:
 def _open_one(path: Path, definitions: str | None) -> Log:
     if path.is_dir():
         log: Log = open_bag(path)
-    elif is_sqlite(path):
+    elif path.suffix == DB3 and path.is_file():
         log = open_sqlite(path)
     else:
         log = open_trace(path) if is_trace(path) else open_mcap(path)  # of any other path its error says what it is

@@ -27,12 +27,8 @@ def place_on_earth(lists: DecodedLists, station: Station, frame: Frame | None, p
     Raises RecordingError, naming `path` and `topic`: the log has no frame, no list has a place, or one out of reach.
     """
     if frame is None:
-        raise RecordingError(
-            "its positions are relative to stations on earth, and the log does not say where it is: give "
-            "`frame: {proj: …}` (docs/guide/place.md)",
-            path=path,
-            topic=topic,
-        )
+        why = "its positions are relative to stations on earth, and the log does not say where it is"
+        raise RecordingError(f"{why}: give `frame: {{proj: …}}` (docs/guide/place.md)", path=path, topic=topic)
     known: Bool = np.all(np.abs(station.place) <= (90.0, 180.0), axis=1)
     if len(known) and not known.any():
         missing = count_noun(len(known), "message")

@@ -295,6 +295,13 @@ def test_messages_without_a_station_are_skipped(tmp_path: Path) -> None:
     assert found.tracks.captured_s == pytest.approx([0.45])
 
 
+def test_several_stations_on_a_topic_are_said(tmp_path: Path) -> None:
+    other = cpm_message(its_ms(0.7), LAT, LON, cpm_object(3, 0, 0), station=8)
+    found = lists_of(drive(tmp_path / "a.mcap", seen(0.5), (0.72, other)))
+    assert found.notes == ("1 station beside the first sends on this topic: all are taken as one unit",)
+    assert len(np.unique(found.track_id)) == 2  # the same number, of another station
+
+
 def test_messages_older_than_the_log_are_skipped(tmp_path: Path) -> None:
     found = lists_of(drive(tmp_path / "a.mcap", seen(-2.0), seen(0.5), seen(0.7)))
     assert found.notes == ("1 message captured more than a second before the log begins: skipped",)

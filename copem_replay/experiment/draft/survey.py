@@ -110,8 +110,7 @@ def _survey_topics(log: Log) -> list[TopicFound]:
             return "truth"
         if channel.number in lists or (channel.schema == osi.SENSOR_DATA and channel.encoding == "protobuf"):
             return "unit"
-        other: Role = "map" if channel.schema == osi.EMBEDDED_MAP else "unread"
-        return "poses" if channel.number in poses else other
+        return "poses" if channel.number in poses else "map" if channel.schema == osi.EMBEDDED_MAP else "unread"
 
     return [TopicFound(c.topic, c.schema, c.encoding, c.messages, role(c)) for c in log.channels]
 

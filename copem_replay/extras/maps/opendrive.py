@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -86,7 +86,7 @@ class _Reading:
             )
 
 
-def read_embedded_map(path: Path, _heights_m: Mapping[str, float] | None = None) -> SiteMap:
+def read_embedded_map(path: Path, _heights_m: object = None) -> SiteMap:
     """The map that a recording has in it, as omega-prime writes it. Raises InputError, with the line of the map."""
     log, name = open_log(path), "open_drive_xml_content"
     maps = {c.number: c for c in log.channels if c.schema == EMBEDDED_MAP and c.messages}
@@ -100,11 +100,7 @@ def read_embedded_map(path: Path, _heights_m: Mapping[str, float] | None = None)
 
 
 def read_opendrive(
-    path: Path,
-    _heights_m: Mapping[str, float] | None = None,
-    *,
-    chord_m: float = CHORD_M,
-    content: bytes | None = None,
+    path: Path, _heights_m: object = None, *, chord_m: float = CHORD_M, content: bytes | None = None
 ) -> SiteMap:
     """Lanes, areas and solids of a map; `content`: of the file, None: it is read. Raises InputError with the line."""
     reading = _Reading(path)

@@ -20,7 +20,7 @@ from copem_replay.core.errors import RecordingError, count_noun
 from copem_replay.core.yaml import NotYamlError, compose_nodes
 from copem_replay.io.channel import Channel
 from copem_replay.io.containers.mcap_records import renumber_message
-from copem_replay.io.containers.sqlite import is_sqlite, open_sqlite
+from copem_replay.io.containers.sqlite import DB3, open_sqlite
 from copem_replay.io.log import CONVERT, BrokenIndexError, Log, open_from_start, open_mcap, unpacking_advice
 from copem_replay.io.window import Window, has_overlap
 
@@ -202,7 +202,7 @@ def open_bag(folder: Path) -> BagLog:
     paths = list_bag_files(folder)
     for path in paths:
         try:
-            logs.append(open_sqlite(path) if is_sqlite(path) else open_mcap(path))
+            logs.append(open_sqlite(path) if path.suffix == DB3 else open_mcap(path))
         except RecordingError as error:
             lost.append(_error_in_file(path, error))
     return _join_bag_files(folder, logs, lost, tuple(note_unnamed_files(folder, paths)))

@@ -13,12 +13,13 @@ from mcap.records import Message
 
 from copem_replay.core.errors import RecordingError
 from copem_replay.io.channel import Channel
-from copem_replay.io.log import SQLITE, Log, open_file
+from copem_replay.io.log import Log
 from copem_replay.io.window import is_kept
 
 if TYPE_CHECKING:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
+DB3: Final = ".db3"
 _FORMATS: Final = {"NONE": "ros2msg", "MSG": "ros2msg", "IDL": "ros2idl"}
 _LAST_NS: Final = 2**63 - 2
 """The largest time that SQLite holds, less what its reader adds."""
@@ -40,14 +41,6 @@ class SqliteLog(Log):
             for connection, time_ns, data in reader.messages(chosen, first_ns, last_ns + 1):
                 if is_kept(spans, connection.id, time_ns):
                     yield Message(connection.id, time_ns, data, time_ns, 0)
-
-
-def is_sqlite(path: Path) -> bool:
-    """Whether a file is of SQLite, by its first bytes."""
-    if not path.is_file():
-        return False
-    with open_file(path) as file:
-        return file.read(len(SQLITE)) == SQLITE
 
 
 def open_sqlite(path: Path) -> SqliteLog:

@@ -539,9 +539,10 @@ class _BatchReader:
 
     def _station(self, message: Int, keep: Int) -> Station | None:
         """The station of the messages (F,) and of the objects `keep` (K,)."""
-        if not self._description.station:
+        within, of = self._description.within, self._found.levels[""]
+        if not self._description.station or within is None:
             return None
-        of = self._found.levels[""]
+        self._notes += find("stations", max(len(of.texts[self._wanted.path(within)].words) - 1, 0))
         place = np.stack([of.numbers["latitude_deg"], of.numbers["longitude_deg"]], axis=1)
         return Station(place[np.searchsorted(of.parent, message)], self.number("after_s")[keep])
 
@@ -605,6 +606,7 @@ class _BatchReader:
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
         probability = self._classes(keep)
+        station = self._station(kept_message, keep)
         columns = DecodedObjects(
             stamp_ns=stamp_ns,
             stamped=stamped,
@@ -626,7 +628,7 @@ class _BatchReader:
             self._covariance(keep),
             probability,
             ids is not None,
-            station=self._station(kept_message, keep),
+            station=station,
         )
 
 

@@ -158,9 +158,9 @@ OSI_VERSION = "3.8.0"
 
 # osi_object.proto: MovingObject.Type and MovingObject.VehicleClassification.Type by class; −1: not a vehicle
 _OSI_TYPE = {"pedestrian": 3, "animal": 4, "other": 1}
-_OSI_VEHICLE = dict(vehicle=0, car=4, van=6, truck=7, trailer=9, motorcycle=10, bicycle=11, bus=12)
+_OSI_CAR = {"vehicle": 0, "car": 4, "van": 6, "truck": 7, "trailer": 9, "motorcycle": 10, "bicycle": 11, "bus": 12}
 _TYPE = np.array([_OSI_TYPE.get(name, 2) for name in CLASSES])
-_VEHICLE = np.array([_OSI_VEHICLE.get(name, -1) for name in CLASSES])
+_VEHICLE = np.array([_OSI_CAR.get(name, -1) for name in CLASSES])
 _MEASURED, _STALE = 2, 1  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED, _OTHER: from an older list only
 
 
