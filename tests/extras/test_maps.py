@@ -458,6 +458,22 @@ def test_a_map_that_cannot_be_used_is_behind_a_sign(tmp_path: Path, text: str, y
     assert why in line
 
 
+@pytest.mark.parametrize(
+    ("definition", "why"),
+    [
+        (None, "the map in it cannot be read: "),
+        (map_topic("").definition, "expected XML, found something else or its end"),
+    ],
+)
+def test_a_message_that_is_no_map_is_one_line(tmp_path: Path, definition: tuple[str, bytes] | None, why: str) -> None:
+    broken = Topic("map", "osi3.MapAsamOpenDrive", [(0, b"\xff\xff")], definition=definition)
+    path = write_recording(tmp_path / "drive.mcap", [(0.0, [Obj()])], more=[broken])
+    with pytest.raises(InputError) as error:
+        read_map(path)
+    assert why in str(error.value)
+    assert format_draft(survey_recording(path)).count("\n# maps: [{file: ") == 1
+
+
 def test_a_recording_without_a_map_is_none(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "drive.mcap", [(0.0, [Obj()])])
     with pytest.raises(InputError, match=r"expected a map in the recording \(osi3.MapAsamOpenDrive\), found none"):

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from copem_replay.core.errors import InputError, RecordingError
 from copem_replay.core.frame import check_scale, write_degrees
@@ -234,11 +233,8 @@ def _try_map(recording: Recording) -> str:
     """Why the map in a recording cannot be used, "": it can."""
     from copem_replay.experiment.maps import MapFile, add_maps
 
-    try:
-        problems = add_maps(recording, [MapFile(file=str(recording.path), frame="same")])[1]
-    except ValidationError as error:
-        return str(error.errors()[0]["msg"])
-    return "; ".join(line for _, line in problems)
+    asked = MapFile.model_construct(file=str(recording.path), frame="same")
+    return "; ".join(line for _, line in add_maps(recording, [asked])[1])
 
 
 def _count_ground(recording: Recording) -> dict[str, int]:

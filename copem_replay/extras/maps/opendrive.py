@@ -20,6 +20,7 @@ from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_a
 from copem_replay.core.tracks import Area, Float
 from copem_replay.extras.convert.commonroad import XmlNode, read_parts
 from copem_replay.extras.maps.opendrive_geometry import CHORD_M, SHAPES, Cubics, Piece, RoadLine
+from copem_replay.io.channel import DefinitionError
 from copem_replay.io.encodings import make_definition
 from copem_replay.io.encodings.columns import shred_messages
 from copem_replay.io.open import open_log
@@ -90,13 +91,14 @@ def read_embedded_map(path: Path, _heights_m: object = None) -> SiteMap:
     """The map that a recording has in it, as omega-prime writes it. Raises InputError, with the line of the map."""
     log, name = open_log(path), "open_drive_xml_content"
     maps = {c.number: c for c in log.channels if c.schema == EMBEDDED_MAP and c.messages}
-    if not maps:
+    found = log.attempt(lambda log: next(log.payloads(frozenset(maps)), None))
+    if found is None:
         raise InputError(f"{path}: expected a map in the recording ({EMBEDDED_MAP}), found none")
-    number, _, payload = next(log.payloads(frozenset(maps)))
-    words = (
-        shred_messages(make_definition(maps[number], [payload]), [payload], texts=[name]).levels[""].texts[name].words
-    )
-    return read_opendrive(path, content="".join(words).encode())
+    try:
+        columns = shred_messages(make_definition(maps[found[0]], [found[2]]), [found[2]], texts=[name]).levels[""]
+    except (DefinitionError, KeyError) as error:
+        raise InputError(f"{path}: the map in it cannot be read: {error}") from None
+    return read_opendrive(path, content="".join(columns.texts[name].words).encode())
 
 
 def read_opendrive(
