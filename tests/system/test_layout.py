@@ -25,7 +25,7 @@ FLOORS = (
 MOST_LINES = {
     "core": 5_300, "io": 12_140, "perception": 3_750, "communication": 1_200, "fusion": 4_200, "metrics": 10_200,
     "experiment": 4_820, "pipeline": 6_100, "results": 7_400, "viewer": 5_400, "report": 5_250, "api": 1_200,
-    "cli": 1_400, "extras": 15_010,
+    "cli": 1_400, "extras": 15_020,
 }  # fmt: skip
 """Of a wing. A change that needs more takes something away, or a decision raises the row."""
 SMALL_LINES = 60
