@@ -91,7 +91,7 @@ def test_a_map_is_moved_and_parts_of_it_left_out(folder: Path) -> None:
     ("{file: town.xodr, frame: same, offset_m: [0, -4]}", "found 0%: is the map in the frame of the log?"),
     ("{file: towm.xodr, frame: same}", "towm.xodr: no such file"),
     ("{file: town.xodr}", "its places are metres: expected `frame: same`"),
-    ("{file: experiment.yaml, frame: same}", "expected a map of OpenDRIVE, OpenDRIVE in a recording, Lanelet2, OpenS"),
+    ("{file: experiment.yaml, frame: same}", "expected a map of OpenDRIVE, Lanelet2, OpenStreetMap, Overpass, GeoJSON"),
 ])  # fmt: skip
 def test_maps_that_are_refused(folder: Path, entry: str, says: str) -> None:
     with pytest.raises(InputError, match=says):

@@ -41,9 +41,6 @@ def _is_geojson(file: _Candidate) -> bool:
 
 FORMATS: Final[dict[str, tuple[Callable[[_Candidate], bool], str]]] = {
     "OpenDRIVE": (lambda file: b"<OpenDRIVE" in file.head, "copem_replay.extras.maps.opendrive:read_opendrive"),
-    "OpenDRIVE in a recording": (
-        lambda file: file.head.startswith(MAGIC), "copem_replay.extras.maps.opendrive:read_embedded_map",
-    ),
     "Lanelet2": (
         lambda file: b"<osm" in file.head and file.has_lanelets(), "copem_replay.extras.maps.lanelet2:read_lanelet2",
     ),
@@ -51,6 +48,9 @@ FORMATS: Final[dict[str, tuple[Callable[[_Candidate], bool], str]]] = {
     "Overpass": (_has_key("elements"), "copem_replay.extras.maps.osm:read_overpass"),
     "GeoJSON": (_is_geojson, "copem_replay.extras.maps.geojson:read_geojson"),
     "Argoverse 2": (_has_key("lane_segments"), "copem_replay.extras.maps.argoverse2:read_argoverse2_map"),
+    "OpenDRIVE in a recording": (
+        lambda file: file.head.startswith(MAGIC), "copem_replay.extras.maps.opendrive:read_embedded_map",
+    ),
 }  # fmt: skip
 """By name: whether a file is of this format, and the function that reads it.
 
