@@ -45,6 +45,7 @@ from copem_replay.experiment.schema import Experiment, LogSettings, output_unit
 from copem_replay.io.config import TruthFields
 from copem_replay.io.findings import find_rule
 from copem_replay.io.open import (
+    DriveRecordings,
     File,
     Local,
     Place,
@@ -382,6 +383,9 @@ def _read_recording(experiment: Experiment, place: Place) -> tuple[Recording | N
 
 def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recording | None, list[RefusedLog]]:
     path = place if isinstance(place, Path) else place.paths[0]
+    if experiment.read.definitions is not None:
+        place = DriveRecordings((place,), (0.0,)) if isinstance(place, Path) else place
+        place = replace(place, definitions=experiment.read.definitions)
     try:
         str(resolve_place(path)).encode()
     except UnicodeEncodeError:
@@ -403,6 +407,12 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line, error.key or None) for line in error.within(path)]
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
+    frame, why, of_frame = None, "", list[str]()
+    try:
+        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
+        recording = replace(recording, scene=replace(recording.scene, frame=frame))
+    except InputError as error:
+        wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
     lists, notes = {}, list(recording.notes)
     for name, asked in experiment.recorded.items():
         try:
@@ -427,13 +437,7 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     except RecordingError as error:
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
-    recording = replace(recording, scene=scene, lists=lists, notes=tuple(notes))
-    frame, why = None, ""
-    try:
-        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
-        recording = replace(recording, scene=replace(scene, frame=frame), notes=(*notes, *of_frame))
-    except InputError as error:
-        wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
+    recording = replace(recording, scene=scene, lists=lists, notes=(*notes, *of_frame))
     far = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
     experiment = resolve_degrees(experiment, frame)
     recording, disagreeing = add_maps(recording, experiment.maps, frame)

@@ -6,7 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
-from copem_replay.core.components import Covariance, Either, Frozen, Id, Latency, NotNegative, Number, Positive, Share
+from copem_replay.core.components import (
+    Covariance,
+    Either,
+    FileBeside,
+    Frozen,
+    Id,
+    Latency,
+    NotNegative,
+    Number,
+    Positive,
+    Share,
+)
 from copem_replay.core.tracks import CLASSES
 from copem_replay.io.schemas.object_lists import Fields
 
@@ -47,10 +58,12 @@ class TruthTopic(Frozen):
     """The topic of the truth in a recording that holds several object lists.
 
     `classes`: the class that a name of one stands for, beside those that are known: `{Barrowlist: bicycle}`.
+    `definitions`: a folder of packages of ROS 2 with the messages whose definitions the recorder left out.
     """
 
     topic: str | None = None
     classes: dict[Id, ClassName] = Field(default_factory=dict)
+    definitions: FileBeside | None = None
 
 
 class TruthFields(Fields):
@@ -58,6 +71,7 @@ class TruthFields(Fields):
 
     topic: str
     classes: dict[Id, ClassName] = Field(default_factory=dict)
+    definitions: FileBeside | None = None
 
 
 class EgoTopic(Frozen):
@@ -74,7 +88,9 @@ class EgoTopic(Frozen):
 
 
 def _truth_key_form(value: object) -> str:
-    named = isinstance(value, TruthFields) or (isinstance(value, dict) and len(value.keys() - {"topic", "classes"}) > 0)
+    named = isinstance(value, TruthFields) or (
+        isinstance(value, dict) and not value.keys() <= TruthTopic.model_fields.keys()
+    )
     return "fields" if named else "topic"
 
 

@@ -87,6 +87,18 @@ RULES: Final = {
     ),
     "late": Rule("message", "stamped earlier than the one before: sorted by time", changes=False),
     "again": Rule("message", "with the time stamp of another: the first kept"),
+    # Lists of stations.
+    "no station": Rule("message", "without the reference position of its station: skipped"),
+    "stations": Rule("station", "beside the first sends on this topic: all are taken as one unit"),
+    "older": Rule("message", "captured more than a second before the log begins: skipped"),
+    "station clock": Rule(
+        "message",
+        "logged {apart:.3f} s after its reference time (leap seconds counted), of another clock: the time of logging "
+        "taken, and `delay_s`",
+    ),
+    "measured apart": Rule(
+        _STATE, "measured up to {most:.3f} s from others of its list: moved to them along its velocity", changes=False
+    ),
     # Objects.
     "twice": Rule(_STATE, "of an id twice in a message: the first kept"),
     "class changes": Rule("object", "of changing class: the most frequent taken", changes=False),

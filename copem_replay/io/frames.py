@@ -437,7 +437,7 @@ def read_decoded_lists(
     return replace(lists, part=channel.part, columns=columns)
 
 
-def _transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:
+def transform_rows(values: Float, covariance: Float, placed: SampledPoses, instant: Int) -> tuple[Float, Float]:
     """Values (K, len(VALUES)) and covariances (K, 3) of rows, transformed by the pose at their `instant (K,)`."""
     values = values.copy()
     values[:, X : Z + 1] = rotate_vectors(placed.rotation[instant], values[:, X : Z + 1]) + placed.position_m[instant]
@@ -495,25 +495,10 @@ def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topi
                 path=path,
                 topic=topic,
             )
-        values[rows], covariance[rows] = _transform_rows(values[rows], covariance[rows], placed, instant)
+        values[rows], covariance[rows] = transform_rows(values[rows], covariance[rows], placed, instant)
         has_place[rows] = placed.there[instant]
         notes.append(f"lists in the frame {name}: brought into {world}")
         if lost := int((~placed.there[instant]).sum()):
             notes.append(f"{count_noun(lost, 'object state')} at instants at which {name} has no place: skipped")
-    columns = lists.columns
-    columns = replace(
-        columns,
-        rows=np.bincount(message[has_place], minlength=len(columns.rows)),
-        object_ix=columns.object_ix[has_place],
-        class_ix=columns.class_ix[has_place],
-        values=values[has_place],
-        notes=(*columns.notes, *notes),
-    )
-    return replace(
-        lists,
-        columns=columns,
-        frame_code=lists.frame_code[has_place],
-        existence=lists.existence[has_place],
-        covariance_m2=covariance[has_place],
-        probability=lists.probability[has_place],
-    )
+    columns = replace(lists.columns, values=values, notes=(*lists.columns.notes, *notes))
+    return replace(lists, columns=columns, covariance_m2=covariance).take_rows(has_place)

@@ -74,8 +74,6 @@ def _describe_file(expected: str, path: Path, start: bytes) -> str:
         return "the file is empty"
     if start.startswith(_LFS_POINTER):
         return "a git-lfs pointer, not the recording itself (`git lfs pull` fetches it)"
-    if start.startswith(SQLITE):
-        return f"a SQLite file, which is not read; of a rosbag2 folder, {CONVERT}"
     if start.startswith(ROS1):
         return f"a bag of ROS 1, which is not read; {_NEWER}"
     if advice := unpacking_advice(path):

@@ -24,6 +24,8 @@ from copem_replay.core.errors import RecordingError, RemoteFile
 from copem_replay.io.channel import Channel
 from copem_replay.io.containers.osi_trace import is_trace, open_trace
 from copem_replay.io.containers.rosbag2 import METADATA, list_bag_files, merge_streams, open_bag
+from copem_replay.io.containers.sqlite import DB3, open_sqlite
+from copem_replay.io.encodings.ros2_types import define_channels
 from copem_replay.io.log import BrokenIndexError, Log, open_file, open_mcap
 from copem_replay.io.window import ALWAYS, Window
 
@@ -35,11 +37,13 @@ class DriveRecordings:
     """Recordings that are read as one; `ahead_s`: how far each clock is ahead of the first one, 0 of the first.
 
     `part`: tells logs apart that are of the same recordings, which may be a single one; "": there is no other.
+    `definitions`: a folder with definitions of messages that their recorders left out.
     """
 
     paths: tuple[Path, ...]
     ahead_s: tuple[float, ...]
     part: str = ""
+    definitions: str | None = None
 
     def __str__(self) -> str:
         return " + ".join(map(str, self.paths))
@@ -289,9 +293,10 @@ def _read_moved(part: JoinedRecording, numbers: Mapping[int, int], sort: bool) -
 
 def open_log(place: Local) -> Log:
     """The log of a recording, or of several as one. Raises RecordingError: nothing in one of them can be read."""
+    open_one = partial(_open_one, definitions=place.definitions if isinstance(place, DriveRecordings) else None)
     if isinstance(place, DriveRecordings) and len(place.paths) > 1:
-        return open_joined(place, _open_one)
-    return _open_one(first_recording(place))
+        return open_joined(place, open_one)
+    return open_one(first_recording(place))
 
 
 def find_drive_recordings(log: Log) -> DriveRecordings | None:
@@ -299,10 +304,14 @@ def find_drive_recordings(log: Log) -> DriveRecordings | None:
     return log.place if isinstance(log, JoinedLog) else None
 
 
-def _open_one(path: Path) -> Log:
+def _open_one(path: Path, definitions: str | None) -> Log:
     if path.is_dir():
-        return open_bag(path)
-    return open_trace(path) if is_trace(path) else open_mcap(path)  # of any other path its error says what it is
+        log: Log = open_bag(path)
+    elif path.suffix == DB3 and path.is_file():
+        log = open_sqlite(path)
+    else:
+        log = open_trace(path) if is_trace(path) else open_mcap(path)  # of any other path its error says what it is
+    return log if definitions is None else replace(log, channels=define_channels(log.channels, definitions))
 
 
 def name_log(path: Path) -> str:

@@ -3,7 +3,7 @@
 Of osi3.SensorData a list is captured at its `last_measurement_time`, else at its time stamp, and arrives at its time
 stamp. Positions are in the world where the message has no host location, else they are transformed from the virtual
 sensor's frame. Lists of other formats are captured and arrive at their stamps; `io/frames.py` brings them into the
-world.
+world, `io/stations.py` those of stations.
 
 `copem-replay` writes a topic `…/detail` beside its own lists: it holds what their messages have no fields for, such as
 captures and full covariances, and these are taken from there.
@@ -49,8 +49,11 @@ from copem_replay.io.schemas.object_lists import DecodedLists
 from copem_replay.io.schemas.osi_ground_truth import SENSOR_DATA, check_osi, load_message_class, osi_id
 from copem_replay.io.schemas.registry import DETAIL_SCHEMA, STRING, known_lists
 from copem_replay.io.stamps import refuse_second_run, settle_stamps
+from copem_replay.io.stations import place_on_earth, settle_measurements
 from copem_replay.io.window import Window
 
+Details = Mapping[int, Mapping[str, Any]]
+"""What `…/detail` says beside lists, by the time in ns at which each was available."""
 _LARGEST_ID = 2**63 - 1
 """OSI's identifiers are unsigned: the highest bit of larger ones is dropped, so that they fit signed integers."""
 
@@ -427,8 +430,14 @@ def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | Non
     if log.window is not None and next(log.payloads(frozenset(c.number for c in same_schema)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
     around = around or read_log_context(log, None, seek_ego=False)
-    lists = transform_to_world(read_decoded_lists(log, same_schema, None, around.classes), around, log.path, topic)
-    return _make_recorded_lists(lists, _read_details(log, topic), log.path, topic, scene)
+    lists = read_decoded_lists(log, same_schema, None, around.classes)
+    if lists.station is not None:
+        lists = place_on_earth(lists, lists.station, scene.frame, log.path, topic)
+        lists, captures = settle_measurements(lists, scene.t0_ns, log.path, topic)
+        return _make_recorded_lists(lists, captures, {}, log.path, topic, scene)
+    lists, details = transform_to_world(lists, around, log.path, topic), _read_details(log, topic)
+    captures = _find_captures(lists.columns.stamp_ns, details)
+    return _make_recorded_lists(lists, captures, details, log.path, topic, scene)
 
 
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
@@ -451,7 +460,7 @@ def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
     return details
 
 
-def _find_captures(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tuple[Int, Bool]:
+def _find_captures(stamps: Int, details: Details) -> tuple[Int, Bool]:
     """(F,) captures of the lists available at `stamps`, and whether `details` state them; else the stamp itself."""
     captured, stated = stamps.copy(), np.zeros(len(stamps), dtype=bool)
     for k, stamp in enumerate(stamps.tolist()):
@@ -461,7 +470,7 @@ def _find_captures(stamps: Int, details: Mapping[int, Mapping[str, Any]]) -> tup
     return captured, stated
 
 
-def _add_details(lists: DecodedLists, details: Mapping[int, Mapping[str, Any]]) -> tuple[DecodedLists, Float]:
+def _add_details(lists: DecodedLists, details: Details) -> tuple[DecodedLists, Float]:
     """The lists with sizes and existence of `details`, and (P, uncertainties) their variances, NaN: not stated."""
     columns = lists.columns
     values, existence = columns.values.copy(), lists.existence.copy()
@@ -485,13 +494,14 @@ def _get_number(item: Any, name: str, otherwise: float) -> float:
 
 
 def _make_recorded_lists(
-    lists: DecodedLists, details: Mapping[int, Mapping[str, Any]], path: Path, topic: str, scene: Scene
+    lists: DecodedLists, captures: tuple[Int, Bool], details: Details, path: Path, topic: str, scene: Scene
 ) -> RecordedLists:
+    """The lists as tracks, with their captures, and whether these are stated."""
+    captured, capture_said = captures
     lists, variances = _add_details(lists, details)
     columns, findings = lists.columns, list[str]()
     turned = ~np.isnan(lists.covariance_m2).all(axis=1)
     variances[:, :3] = np.where(np.asarray(turned)[:, None], lists.covariance_m2, 0.0)  # turned with its list
-    captured, capture_said = _find_captures(columns.stamp_ns, details)
     entries = _Entries(
         np.repeat(np.arange(len(columns.rows)), columns.rows),
         columns.values,

@@ -324,7 +324,8 @@ def _describe_ignored(
         has_messages = channel.messages and channel.number not in poses
         # A topic of the truth may hold messages of another schema, too.
         of_topic = is_truth(channel) or channel.schema == topics.get(channel.topic)
-        if has_messages and not (channel.topic in topics and of_topic) and channel.topic not in beside:
+        beside_it = channel.topic in beside or channel.schema == osi.EMBEDDED_MAP
+        if has_messages and not (channel.topic in topics and of_topic) and not beside_it:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{count_noun(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 
@@ -365,6 +366,8 @@ def _decode_world(
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
     around = replace(around, classes=classes)
     lists = read_decoded_lists(log, same_schema, fields, classes)
+    if lists.station is not None:
+        raise RecordingError("its positions are relative to stations; " + _NO_TRUTH, path=log.path, topic=topic)
     if (fields is None and not names_objects(same_schema[0])) or (fields is not None and fields.id is None):
         raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
     if not lists.named and len(lists.columns.object_ix):

@@ -112,6 +112,7 @@ def test_survey(path):
                         "middle_m": [0.0, 0.0],
                     }
                 ],
+                "map": None,
                 "suggested": {
                     "ego": None,
                     "ego_why": "the log names its host vehicle: 4 (car)",

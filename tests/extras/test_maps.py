@@ -9,15 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from osi3.osi_groundtruth_pb2 import GroundTruth
 from scipy.integrate import quad
 
+from copem_replay.cli.main import main
 from copem_replay.core.errors import InputError
+from copem_replay.experiment.draft.survey import survey_recording
+from copem_replay.experiment.draft.template import describe_survey, format_draft
 from copem_replay.extras.maps.opendrive import read_opendrive
 from copem_replay.extras.maps.opendrive_geometry import follow_clothoid
 from copem_replay.extras.maps.registry import read_map
 from copem_replay.io.schemas.osi_lanes import read_road
 from copem_replay.io.write.osi import add_road
+from tests.helpers.recordings import Obj, Topic, write_recording
 
 SHARED = Path(__file__).parents[3] / "shared/data"
 MAPS = SHARED / "maps"
@@ -389,3 +394,87 @@ def test_a_map_of_argoverse_comes_back_from_osi() -> None:
     assert [area.name for area in road.crosswalks] == [area.name for area in crosswalks]
     for area, as_written in zip(road.crosswalks, crosswalks, strict=True):
         np.testing.assert_allclose(area.rings_m[0], as_written.rings_m[0], atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ in a recording
+
+
+def map_topic(text: str) -> Topic:
+    """As omega-prime writes a map: a message of its own package, which OSI does not have."""
+    file = FileDescriptorProto(name="osi_mapasamopendrive.proto", package="osi3")
+    message = file.message_type.add(name="MapAsamOpenDrive")
+    for number, name in enumerate(("map_reference", "open_drive_xml_content"), 1):
+        message.field.add(name=name, number=number, label=1, type=9)  # optional, string
+    content = text.encode()
+    length = bytes([len(content) & 0x7F | 0x80, len(content) >> 7])  # a varint of two bytes
+    payload = b"\x0a\x04town" + b"\x12" + length + content
+    definition = FileDescriptorSet(file=[file]).SerializeToString()
+    return Topic("ground_truth_map", "osi3.MapAsamOpenDrive", [(0, payload)], definition=("protobuf", definition))
+
+
+def drive(path: Path, text: str, y: float = 18.5) -> Path:
+    """A car along the lane of `road()`, whose middle is at 18.5 m, at `y`, with the ego beside the road."""
+    frames = [(k / 20, [Obj(id=1, x=60.0, y=40.0), Obj(id=2, x=12.0 + k / 2, y=y, vx=10.0)]) for k in range(150)]
+    return write_recording(path, frames, host=1, more=[map_topic(text)])
+
+
+def test_a_map_in_a_recording_is_that_of_a_file(tmp_path: Path) -> None:
+    text = road()
+    (found,) = read_map(drive(tmp_path / "drive.mcap", text)).lanes
+    (of_file,) = read_map(written(tmp_path, text)).lanes
+    assert found.left_m.tolist() == of_file.left_m.tolist() == [[10, 20, 0], [110, 20, 0]]
+
+
+def test_a_draft_uses_the_map_in_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    drive(Path("drive.mcap"), road())
+    survey = survey_recording("drive.mcap")
+    assert [(t.topic, t.role) for t in survey.topics] == [("truth", "truth"), ("ground_truth_map", "map")]
+    assert survey.truth[0].notes == []
+    assert any("a map, for `maps: [{file: …, frame: same}]`" in line for line in describe_survey(survey))
+    draft = format_draft(survey)
+    assert "\nmaps: [{file: drive.mcap, frame: same}]   # the map in the recording\n" in draft
+    Path("experiment.yaml").write_text(draft)
+    monkeypatch.setattr("sys.argv", ["copem-replay", "check", "experiment.yaml"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    assert "drive.mcap: agreement with the traffic 1.00" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "y", "why"),
+    [
+        (road(), 60.0, "drive.mcap: expected at least"),  # nobody drives on it
+        ("<OpenDRIVE><header/>", 18.5, "expected XML, found something else or its end"),
+    ],
+)
+def test_a_map_that_cannot_be_used_is_behind_a_sign(tmp_path: Path, text: str, y: float, why: str) -> None:
+    draft = format_draft(survey_recording(drive(tmp_path / "drive.mcap", text, y)))
+    (line,) = (line for line in draft.splitlines() if "maps:" in line and "frame: same" in line)
+    assert line.startswith("# maps: ")
+    assert why in line
+
+
+@pytest.mark.parametrize(
+    ("definition", "why"),
+    [
+        (None, "the map in it cannot be read: "),
+        (map_topic("").definition, "expected XML, found something else or its end"),
+    ],
+)
+def test_a_message_that_is_no_map_is_one_line(tmp_path: Path, definition: tuple[str, bytes] | None, why: str) -> None:
+    broken = Topic("map", "osi3.MapAsamOpenDrive", [(0, b"\xff\xff")], definition=definition)
+    path = write_recording(tmp_path / "drive.mcap", [(0.0, [Obj()])], more=[broken])
+    with pytest.raises(InputError) as error:
+        read_map(path)
+    assert why in str(error.value)
+    assert format_draft(survey_recording(path)).count("\n# maps: [{file: ") == 1
+
+
+def test_a_recording_without_a_map_is_none(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "drive.mcap", [(0.0, [Obj()])])
+    with pytest.raises(InputError, match=r"expected a map in the recording \(osi3.MapAsamOpenDrive\), found none"):
+        read_map(path)

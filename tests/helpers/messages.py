@@ -1,6 +1,7 @@
 """Messages for the tests of formats: ROS 2 ones serialised by rosbags, and what was read of them in short."""
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,16 @@ def defined(text: str, name: str = "p/msg/A", encoding: str = "ros2msg") -> CdrD
     return CdrDefinition(name, encoding, text.encode())
 
 
-def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
-    """By rosbags."""
+@cache
+def store_of(text: str, name: str) -> Any:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, name))
+    return store
+
+
+def serialised(text: str, message: dict[str, Any], *, little: bool = True, name: str = "p/msg/A") -> bytes:
+    """By rosbags; fields that the message lacks are 0, or empty."""
+    store = store_of(text, name)
 
     def made(name: str, value: dict[str, Any]) -> Any:
         fields = store.get_msgdef(name).fields
@@ -33,8 +40,8 @@ def serialised(text: str, message: dict[str, Any], *, little: bool = True, name:
         if kind == 1:
             return value
         if kind == 2:
-            return made(detail, value)
-        item = detail[0]
+            return made(detail, value or {})
+        item, value = detail[0], [] if isinstance(value, int) else value
         if int(item[0]) == 1 and item[1][0] != "string":
             return np.array(value, dtype={"byte": "u1", "char": "u1"}.get(item[1][0], item[1][0]))
         return [filled(item, v) for v in value]

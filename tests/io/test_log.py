@@ -57,7 +57,6 @@ def test_directory(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
-        ("bag_0.db3", b"SQLite format 3\0" + bytes(84), "a SQLite file, which is not read; of a rosbag2 folder, `ros2"),
         ("a.osi.xz", b"\xfd7zXZ\0", "compressed as a whole, which is not read; unpack it first: xz -d a.osi.xz"),
         (
             "a.mcap.zstd",

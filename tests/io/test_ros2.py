@@ -542,7 +542,69 @@ def test_json_scenes_may_leave_out_much() -> None:
     assert found.frames == ()
 
 
+# ------------------------------------------------------------------------------------------------ ika
+
+OBJECT_LIST = text_of(
+    "std_msgs/Header header\nObject[] objects",
+    p__Object="uint64 id\nfloat64 existence_probability\nState state\nState[] state_history\nPrediction[] predictions",
+    p__State=(
+        "std_msgs/Header header\nuint8 model_id\nuint64[] sensor_id\nfloat64[] continuous_state\n"
+        "int64[] discrete_state\nfloat64[] continuous_state_covariance\nKind[] classifications\n"
+        "ReferencePoint reference_point"
+    ),
+    p__Kind="uint8 CAR=4\nuint8 type\nfloat64 probability",
+    p__ReferencePoint="uint8 value\ngeometry_msgs/Vector3 translation_to_geometric_center",
+    p__Prediction="float64 probability\nState[] states",
+)
+
+
+def ika_object(number: int, model: int, state: list[float], covariance: list[float], kind: int) -> dict[str, Any]:
+    """Its reference point is 1.4 m behind its centre, 0.2 m to the right of it and 0.75 m below."""
+    point = {"value": 11, "translation_to_geometric_center": xyz(1.4, 0.2, 0.75)}
+    of = {"header": HEADER, "model_id": model, "sensor_id": [7], "continuous_state": state, "reference_point": point,
+          "continuous_state_covariance": covariance, "discrete_state": [0, 0, 0, 0],
+          "classifications": [{"type": kind, "probability": 0.8}]}  # fmt: skip
+    return {"id": number, "existence_probability": 0.7, "state": of, "state_history": [of], "predictions": []}
+
+
+def test_object_list_of_ika() -> None:
+    """States of both models, the same car to the north; of another model nothing is known."""
+    spread = {size: [0.0] * size * size for size in (12, 16)}
+    for size, cells in spread.items():
+        cells[0], cells[1], cells[size], cells[size + 1] = 0.25, 0.1, 0.1, 0.5
+    yaw = math.pi / 2
+    iscactr = [10, 20, 0, 5, 1, 0, 0, yaw, 0, 1.8, 4.5, 1.5]
+    hexamotion = [10, 20, 0, 5, 1, 0, 0, 0, 0, yaw, 0, 0, 0, 4.5, 1.8, 1.5]
+    found = written(
+        "perception_msgs/msg/ObjectList",
+        OBJECT_LIST,
+        {
+            "header": HEADER,
+            "objects": [
+                ika_object(3, 16, iscactr, spread[12], 4),
+                ika_object(4, 17, hexamotion, spread[16], 1),
+                ika_object(5, 1, iscactr, spread[12], 4),
+                ika_object(6, 16, iscactr, [], 4),
+            ],
+        },
+    )
+    assert ids(found) == ["3", "4", "5", "6"]
+    assert classes(found) == ["car", "pedestrian", "car", "car"]
+    assert values(found, "x_m") == [9.8, 9.8, None, 9.8]
+    assert values(found, "y_m") == [21.4, 21.4, None, 21.4]
+    assert values(found, "z_m")[0] == 0.75
+    assert values(found, "yaw_rad") == [yaw, yaw, None, yaw]
+    assert values(found, "vx_mps")[:2] == [-1.0, -1.0]
+    assert values(found, "vy_mps")[:2] == [5.0, 5.0]
+    sides = [values(found, f"{side}_m") for side in ("length", "width", "height")]
+    assert [side[:2] for side in sides] == [[4.5, 4.5], [1.8, 1.8], [1.5, 1.5]]
+    assert found.covariance_m2[:2].tolist() == [[0.25, 0.1, 0.5]] * 2
+    assert np.isnan(found.covariance_m2[2:]).all()
+    assert found.existence.tolist() == [0.7] * 4
+    assert found.columns.stamp_ns.tolist() == [STAMP]
+
+
 def test_what_is_known_by_name() -> None:
     scenes = {"foxglove.SceneUpdate", "foxglove_msgs/msg/SceneUpdate"}
     assert scenes < set(SCHEMAS)
-    assert len(SCHEMAS) == 9 + len(scenes)
+    assert len(SCHEMAS) == 14 + len(scenes)

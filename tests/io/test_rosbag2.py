@@ -216,10 +216,6 @@ def test_what_is_no_description(bag, content, why):
 NAMED = {
     "none": ([], "BAG/metadata.yaml: names no file (`relative_file_paths`)"),
     "missing": (["bag_0.mcap", "bag_7.mcap"], "BAG/bag_7.mcap: no such file, but metadata.yaml names it"),
-    "SQLite": (
-        ["bag_0.db3"],
-        "BAG: its files are of SQLite (.db3), which is not read; `ros2 bag convert` makes MCAP of it",
-    ),
     "above": (["../x.mcap"], "BAG/metadata.yaml: expected files of the folder, found '../x.mcap'"),
     "elsewhere": (["/etc/hosts"], "BAG/metadata.yaml: expected files of the folder, found '/etc/hosts'"),
     "too long": (["a" * 300], f"BAG/{'a' * 300}: no such file, but metadata.yaml names it"),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from copem_replay.io.schemas.description import Fields
 
 
-Role = Literal["truth", "unit", "poses", "unread"]
+Role = Literal["truth", "unit", "poses", "map", "unread"]
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,7 @@ class TruthFound:
     place: str  # on earth: projection and middle of the log, or why there is none
     vehicles: str  # ids of objects that move, as messages list them
     units: list[UnitFound]
+    map: str | None  # why the map in the recording cannot be used, "": it can; None: there is none
     suggested: Suggestion
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -74,7 +75,10 @@ def survey_recording(place: Local | str) -> RecordingSurvey:
     except RecordingError as error:
         topics = list(truth_topics(log))
         if not topics:
-            units = list(_survey_units_alone(log, place, survey.topics))
+            scene = make_empty_scene(log.path.stem, log.start_ns, log.end_ns)
+            units = list(
+                _survey_units(place, scene, [t.topic for t in survey.topics if t.role == "unit" and t.messages])
+            )
             return replace(survey, reason=str(error), proposals=_list_proposals(log, survey.topics), units=units)
         survey = replace(survey, choice=str(error))
     truth, failures = [], []
@@ -105,34 +109,28 @@ def _survey_topics(log: Log) -> list[TopicFound]:
             return "truth"
         if channel.number in lists or (channel.schema == osi.SENSOR_DATA and channel.encoding == "protobuf"):
             return "unit"
-        return "poses" if channel.number in poses else "unread"
+        return "poses" if channel.number in poses else "map" if channel.schema == osi.EMBEDDED_MAP else "unread"
 
     return [TopicFound(c.topic, c.schema, c.encoding, c.messages, role(c)) for c in log.channels]
 
 
-def _survey_units(recording: Recording, topics: Sequence[str]) -> Iterator[UnitFound]:
-    """The lists of each unit; `problem` where they cannot be read."""
+def _survey_units(
+    place: Local, scene: Scene, topics: Sequence[str], recording: Recording | None = None
+) -> Iterator[UnitFound]:
+    """The lists of each unit, held against the truth where there is a `recording`; `problem`: they cannot be read."""
+    if topics and recording is not None and recording.place_said is not None:
+        with suppress(InputError):  # the line on its place says why
+            scene = replace(scene, frame=recording.place_said.read()[0])
     for topic in dict.fromkeys(topics):
         from copem_replay.io.recorded_lists import read_unit_lists  # it takes time, and most recordings have no lists
 
         try:
-            lists = read_unit_lists(recording.local, topic, recording.scene, recording.around)
+            lists = read_unit_lists(place, topic, scene, None if recording is None else recording.around)
         except RecordingError as error:
-            yield UnitFound(topic, problem="; ".join(error.within(recording.path, topic)))
+            yield UnitFound(topic, problem="; ".join(error.within(first_recording(place), topic)))
             continue
-        yield _survey_unit(topic, lists, _compare_with_truth(recording, lists) if len(lists.tracks.stamp_ns) else {})
-
-
-def _survey_units_alone(log: Log, place: Local, topics: Sequence[TopicFound]) -> Iterator[UnitFound]:
-    """The lists of each unit of a recording without truth, as far as they can be read."""
-    from copem_replay.io.recorded_lists import read_unit_lists
-
-    scene = make_empty_scene(log.path.stem, log.start_ns, log.end_ns)
-    for topic in dict.fromkeys(t.topic for t in topics if t.role == "unit" and t.messages):
-        try:
-            yield _survey_unit(topic, read_unit_lists(place, topic, scene, None), {})
-        except RecordingError as error:
-            yield UnitFound(topic, problem="; ".join(error.within(log.path, topic)))
+        known = _compare_with_truth(recording, lists) if recording is not None and len(lists.tracks.stamp_ns) else {}
+        yield _survey_unit(topic, lists, known)
 
 
 def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> UnitFound:
@@ -202,7 +200,7 @@ def _survey_truth(
     between_s = np.diff(truth.stamp_ns) * 1e-9
     longest = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
-    found = list(_survey_units(recording, units))
+    found = list(_survey_units(recording.local, scene, units, recording))
     return TruthFound(
         topic=recording.topic,
         frames=len(truth.stamp_ns),
@@ -226,8 +224,17 @@ def _survey_truth(
         place=_describe_place(log, recording),
         vehicles=moving_ids(scene, shown=6),
         units=found,
+        map=_try_map(recording) if recording.together is None and any(t.role == "map" for t in topics) else None,
         suggested=suggest_experiment(log, recording, found, fields),
     )
+
+
+def _try_map(recording: Recording) -> str:
+    """Why the map in a recording cannot be used, "": it can."""
+    from copem_replay.experiment.maps import MapFile, add_maps
+
+    asked = MapFile.model_construct(file=str(recording.path), frame="same")
+    return "; ".join(line for _, line in add_maps(recording, [asked])[1])
 
 
 def _count_ground(recording: Recording) -> dict[str, int]:

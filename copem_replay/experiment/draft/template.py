@@ -272,6 +272,9 @@ def _describe_objects(truths: Sequence[TruthFound]) -> str:
 def _draft_read(survey: RecordingSurvey, truth: TruthFound) -> Iterator[str]:
     if survey.proposals:
         yield from format_read_block(survey.proposals[0])
+    if (why := truth.map) is not None:
+        line = f"maps: [{{file: {quote_yaml(survey.log)}, frame: same}}]   # the map in the recording"
+        yield f"# {line}, cannot be used: {_format_comment(why)}" if why else line
     if not survey.choice:
         return
     others = [t.topic for t in survey.truth if t.topic != truth.topic]
@@ -504,6 +507,7 @@ _ROLES: Final[Mapping[Role, str]] = {
     "truth": "the truth",
     "unit": "lists of a unit, for `recorded: {topic: …}`",
     "poses": "poses",
+    "map": "a map, for `maps: [{file: …, frame: same}]`",
     "unread": "not read",
 }
 

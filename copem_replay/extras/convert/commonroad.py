@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from io import BytesIO
 from pathlib import Path
 from typing import Final
 from xml.parsers import expat
@@ -71,14 +72,18 @@ class XmlNode:
         return node
 
 
-def read_parts(path: Path, root_tags: tuple[str, ...], *, most_elements: int | None = None) -> Iterator[XmlNode]:
+def read_parts(
+    path: Path, root_tags: tuple[str, ...], *, most_elements: int | None = None, content: bytes | None = None
+) -> Iterator[XmlNode]:
     """Yield the root without its children, then each child once it is complete.
 
-    `most_elements`: of one child. Raises InputError.
+    `most_elements`: of one child. `content`: what is read, None: that of the file. Raises InputError.
     """
     reading = _ParserHandlers(path, root_tags, most_elements)
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as stream:
+        with (
+            BytesIO(content) if content is not None else gzip.open(path) if path.suffix == ".gz" else path.open("rb")
+        ) as stream:
             while block := stream.read(_BLOCK_BYTES):
                 reading.parser.Parse(block, False)
                 while reading.done:

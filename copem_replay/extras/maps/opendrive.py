@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,6 +20,11 @@ from copem_replay.core.site_map import Lane, LaneKind, MapSolid, SiteMap, make_a
 from copem_replay.core.tracks import Area, Float
 from copem_replay.extras.convert.commonroad import XmlNode, read_parts
 from copem_replay.extras.maps.opendrive_geometry import CHORD_M, SHAPES, Cubics, Piece, RoadLine
+from copem_replay.io.channel import DefinitionError
+from copem_replay.io.encodings import make_definition
+from copem_replay.io.encodings.columns import shred_messages
+from copem_replay.io.open import open_log
+from copem_replay.io.schemas.osi_ground_truth import EMBEDDED_MAP
 
 _FARTHEST: Final = 1e8
 """No number of a map is larger: metres of projections are below 2e7."""
@@ -82,11 +87,27 @@ class _Reading:
             )
 
 
-def read_opendrive(path: Path, _heights_m: Mapping[str, float] | None = None, *, chord_m: float = CHORD_M) -> SiteMap:
-    """Lanes, areas and solids of a map. Raises InputError with file and line."""
+def read_embedded_map(path: Path, _heights_m: object = None) -> SiteMap:
+    """The map that a recording has in it, as omega-prime writes it. Raises InputError, with the line of the map."""
+    log, name = open_log(path), "open_drive_xml_content"
+    maps = {c.number: c for c in log.channels if c.schema == EMBEDDED_MAP and c.messages}
+    found = log.attempt(lambda log: next(log.payloads(frozenset(maps)), None))
+    if found is None:
+        raise InputError(f"{path}: expected a map in the recording ({EMBEDDED_MAP}), found none")
+    try:
+        columns = shred_messages(make_definition(maps[found[0]], [found[2]]), [found[2]], texts=[name]).levels[""]
+    except (DefinitionError, KeyError) as error:
+        raise InputError(f"{path}: the map in it cannot be read: {error}") from None
+    return read_opendrive(path, content="".join(columns.texts[name].words).encode())
+
+
+def read_opendrive(
+    path: Path, _heights_m: object = None, *, chord_m: float = CHORD_M, content: bytes | None = None
+) -> SiteMap:
+    """Lanes, areas and solids of a map; `content`: of the file, None: it is read. Raises InputError with the line."""
     reading = _Reading(path)
     proj, offset_m, yaw_rad = "", (0.0, 0.0), 0.0
-    for part in read_parts(path, ("OpenDRIVE",), most_elements=300_000):
+    for part in read_parts(path, ("OpenDRIVE",), most_elements=300_000, content=content):
         if part.tag == "header":
             reference = part.find("geoReference")
             proj = "" if reference is None else reference.text.strip()

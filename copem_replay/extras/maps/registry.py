@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 from copem_replay.core.errors import InputError
 from copem_replay.core.site_map import SiteMap
 from copem_replay.experiment.maps import DEFAULT_HEIGHTS_M
+from copem_replay.io.containers.mcap_records import MAGIC
 
 _LANELET: Final = re.compile(rb"""v\s*=\s*["']lanelet["']""")
 
@@ -47,6 +48,9 @@ FORMATS: Final[dict[str, tuple[Callable[[_Candidate], bool], str]]] = {
     "Overpass": (_has_key("elements"), "copem_replay.extras.maps.osm:read_overpass"),
     "GeoJSON": (_is_geojson, "copem_replay.extras.maps.geojson:read_geojson"),
     "Argoverse 2": (_has_key("lane_segments"), "copem_replay.extras.maps.argoverse2:read_argoverse2_map"),
+    "OpenDRIVE in a recording": (
+        lambda file: file.head.startswith(MAGIC), "copem_replay.extras.maps.opendrive:read_embedded_map",
+    ),
 }  # fmt: skip
 """By name: whether a file is of this format, and the function that reads it.
 

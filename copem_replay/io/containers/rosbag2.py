@@ -1,4 +1,4 @@
-"""A rosbag2 folder as one recording: the MCAP files that its `metadata.yaml` names, in order of log time.
+"""A rosbag2 folder as one recording: the files that its `metadata.yaml` names, in order of log time.
 
 Channels of several files that agree in topic, schema, encoding and metadata are one. A file is opened when its first
 message is due, and closed after its last one. A damaged file is read as far as it goes; of several files, one that
@@ -20,6 +20,7 @@ from copem_replay.core.errors import RecordingError, count_noun
 from copem_replay.core.yaml import NotYamlError, compose_nodes
 from copem_replay.io.channel import Channel
 from copem_replay.io.containers.mcap_records import renumber_message
+from copem_replay.io.containers.sqlite import DB3, open_sqlite
 from copem_replay.io.log import CONVERT, BrokenIndexError, Log, open_from_start, open_mcap, unpacking_advice
 from copem_replay.io.window import Window, has_overlap
 
@@ -32,15 +33,12 @@ _LONGEST_BYTES = 1 << 19
 
 
 def list_bag_files(folder: Path) -> list[Path]:
-    """The MCAP files of a folder in the order of its description; all of them exist. Raises RecordingError."""
+    """The files of a folder in the order of its description; all of them exist. Raises RecordingError."""
     place = folder / METADATA
     information = _find_information(folder)
-    storage = _node_text(information, "storage_identifier")
     names = _list_file_names(information)
     if not names:
         raise RecordingError("names no file (`relative_file_paths`)", path=place)
-    if storage == "sqlite3" or any(name.endswith(".db3") for name in names):
-        raise RecordingError(f"its files are of SQLite (.db3), which is not read; {CONVERT}", path=folder)
     if _node_text(information, "compression_mode").lower() == "message":
         raise RecordingError(f"its messages are compressed one by one, which is not read; {CONVERT}", path=folder)
     return [_bag_file_path(folder, name) for name in names]
@@ -63,7 +61,7 @@ def _find_information(folder: Path) -> Node:
             content = file.read(_LONGEST_BYTES + 1)
     except FileNotFoundError:
         advice = "; name its files as logs of their own, or let `ros2 bag reindex` write it: then they are one"
-        ending = advice if any(folder.glob("*.mcap")) else ""
+        ending = advice if any([*folder.glob("*.mcap"), *folder.glob("*.db3")]) else ""
         raise RecordingError(f"expected a recording, found a folder without {METADATA}{ending}", path=folder) from None
     except OSError as error:
         raise RecordingError(f"cannot be opened: {error.strerror}", path=place) from None
@@ -204,7 +202,7 @@ def open_bag(folder: Path) -> BagLog:
     paths = list_bag_files(folder)
     for path in paths:
         try:
-            logs.append(open_mcap(path))
+            logs.append(open_sqlite(path) if path.suffix == DB3 else open_mcap(path))
         except RecordingError as error:
             lost.append(_error_in_file(path, error))
     return _join_bag_files(folder, logs, lost, tuple(note_unnamed_files(folder, paths)))

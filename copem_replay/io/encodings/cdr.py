@@ -175,20 +175,10 @@ def walk_cdr(
 
 # The program of a definition.
 
-BASES = {
-    "bool": (1, "u1"),
-    "byte": (1, "u1"),
-    "char": (1, "u1"),
-    "int8": (1, "i1"),
-    "uint8": (1, "u1"),
-    "int16": (2, "i2"),
-    "uint16": (2, "u2"),
-    "int32": (4, "i4"),
-    "uint32": (4, "u4"),
-    "int64": (8, "i8"),
-    "uint64": (8, "u8"),
-    "float32": (4, "f4"),
-    "float64": (8, "f8"),
+BASES = {"bool": (1, "u1"), "byte": (1, "u1"), "char": (1, "u1")} | {
+    f"{word}{8 * size}": (size, f"{word[0]}{size}")
+    for word, sizes in (("int", (1, 2, 4, 8)), ("uint", (1, 2, 4, 8)), ("float", (4, 8)))
+    for size in sizes
 }
 """Types of numbers: the size in bytes and NumPy's name."""
 STRING_TYPE = "string"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -89,14 +89,6 @@ class Fields(Frozen):
 
 
 @dataclass(frozen=True)
-class SolidField:
-    """The paths of an object's type of solid (box, sphere, cylinder, cone) and of its dimensions (shape_msgs)."""
-
-    kind: str
-    dimensions: str
-
-
-@dataclass(frozen=True)
 class StaysField:
     """Paths, from the message, of what ends a thing: its `lifetime` (0: none does), and removals.
 
@@ -111,14 +103,20 @@ class StaysField:
     all: tuple[str, ...]
 
 
+Made = tuple[Any, ...]
+"""A column of numbers that messages have in other units, or in parts: what makes it, and of which columns."""
+
+
 @dataclass(frozen=True)
 class Description:
     """A format: its fields, the values of paths that select objects (`only`), and the path an id is unique `within`.
 
     `said`: paths of numbers that are 0 where an object does not state its `yaw`, `velocity`, `covariance`. `footprint`:
-    the points of an object's outline, with x and y along its axes, for objects without length and width. `solid`: the
-    fields of its shape. `largest_of`: the list of things that may have several bodies, of which the largest counts.
-    `stays`: how things end that exist until a message removes them.
+    the points of an object's outline, with x and y along its axes, for objects without length and width. `largest_of`:
+    the list of things that may have several bodies, of which the largest counts. `stays`: how things end that exist
+    until a message removes them. `made`: columns by the paths that name them. `station`: whether positions are east and
+    north of a station: then columns are made of its `/latitude_deg` and `/longitude_deg`, and of `after_s`, the time
+    from the stamp to the measurement of an object.
     """
 
     fields: Fields
@@ -126,6 +124,7 @@ class Description:
     within: str | None = None
     said: Mapping[Literal["yaw", "velocity", "covariance"], str] = field(default_factory=dict)
     footprint: str | None = None
-    solid: SolidField | None = None
     largest_of: str | None = None
     stays: StaysField | None = None
+    made: Mapping[str, Made] = field(default_factory=dict)
+    station: bool = False

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from copem_replay.io.encodings.columns import (
     ancestor_rows,
     any_item_path,
     common_level,
+    format_number,
     list_level,
     list_levels,
     shred_messages,
@@ -58,7 +59,9 @@ class WantedPaths:
     """
 
     def __init__(self, description: Description, offers: Collection[str]) -> None:
-        self._fields, self._described, self._offers = description.fields, description, offers
+        self._fields, self._described = description.fields, description
+        self.made = {self.path(name): made for name, made in description.made.items()}
+        self._offers = dict.fromkeys([*offers, *map(any_item_path, self.made)])
         objects = any_item_path(self._fields.objects)
         lists = {level for path in offers for level in list_levels([path]) if level}
         if objects not in lists or not self._fields.objects.endswith("[]"):
@@ -135,9 +138,6 @@ class WantedPaths:
         texts += [self._of_object("only", path) for path in described.only]
         if described.within is not None:
             texts.append(self._of_object("id", described.within))
-        if described.solid is not None:
-            numbers += [self._of_object("length_m", described.solid.kind)]
-            numbers += [self._of_object("length_m", f"{described.solid.dimensions}[{k}]") for k in range(2)]
         self.lifetime: list[str] = []
         self.removal: list[str] = []
         if (stays := described.stays) is not None:
@@ -146,7 +146,22 @@ class WantedPaths:
             self.removal = paths if {*paths} <= {*self._offers} else []
             texts += self.lifetime + self.removal
         texts += self.stamp
+        numbers += [self._need("made", self.path(path)) for _, *of in self.made.values() for path in of]
         return numbers, texts
+
+    def shred(self, definition: Definition, payloads: Sequence[bytes]) -> ShreddedMessages:
+        """The columns of messages, with those that are made of others."""
+        plain = ([path for path in paths if path not in self.made] for paths in (self.numbers, self.texts))
+        found = shred_messages(definition, payloads, *plain)
+        for name, (make, *of) in self.made.items():
+            rows, parts = found.levels[list_level(name)], [(path, list_level(path)) for path in map(self.path, of)]
+            columns = (found.levels[at].numbers[p][ancestor_rows(found, list_level(name), at)] for p, at in parts)
+            rows.numbers[name] = values = make(*columns)
+            if name in self.texts:
+                distinct, code = np.unique(values, return_inverse=True)
+                words = tuple(map(format_number, distinct.tolist()))
+                rows.texts[name] = DistinctTexts(np.where(np.isnan(values), -1, code), words)
+        return found
 
     def _stamp_paths(self) -> list[str]:
         stamp = self._fields.stamp
@@ -159,10 +174,8 @@ class WantedPaths:
         return paths
 
 
-# Boxes of objects whose shape is an outline, a solid other than a box, or several bodies.
+# Boxes of objects whose shape is an outline, or several bodies.
 
-_SPHERE, _CYLINDER, _CONE = 2, 3, 4
-"""Types of shape_msgs/SolidPrimitive; a cylinder and a cone have a height and a radius."""
 _YAW = VALUES.index("yaw_rad")
 _SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
 _SIZES = slice(VALUES.index("length_m"), VALUES.index("height_m") + 1)
@@ -185,18 +198,6 @@ def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint
     values[flat, _SIZE] = most[flat] - least[flat]
     values[flat, 0] += middle[:, 0] * np.cos(yaw) - middle[:, 1] * np.sin(yaw)
     values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
-
-
-def fit_solids(values: Float, kind: Float, first: Float, second: Float) -> None:
-    """Set the sizes in `values (P, V)` of solids other than boxes to those of the box around them.
-
-    `kind (P,)`: the type of shape_msgs/SolidPrimitive; `first (P,)` and `second (P,)`: its first two dimensions.
-    """
-    ball, upright = kind == _SPHERE, (kind == _CYLINDER) | (kind == _CONE)
-    across = 2.0 * np.where(ball, first, second)
-    height = np.where(ball, across, first)
-    round_ = ball | upright
-    values[round_, _SIZES] = np.stack([across, across, height], axis=1)[round_]
 
 
 def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: str, of: str) -> Bool:
@@ -253,6 +254,17 @@ __all__ = ["ClassField", "DecodedLists", "Description", "Fields", "FieldsError",
 
 
 @dataclass(frozen=True)
+class Station:
+    """The station that lists are relative to. `place (F, 2)`: latitude and longitude in degrees, NaN: not said.
+
+    `after_s (P,)`: when objects were measured, in s after the stamp of their list.
+    """
+
+    place: Float
+    after_s: Float
+
+
+@dataclass(frozen=True)
 class DecodedLists:
     """The lists of one topic, with properties of entries that only recorded units need, (P,) each.
 
@@ -268,6 +280,17 @@ class DecodedLists:
     probability: Float
     named: bool  # whether its objects have ids
     part: str = ""  # the recording they are from, of several of one drive
+    station: Station | None = None  # that positions are relative to, in m east and north of it
+
+    def take_rows(self, kept: Bool) -> DecodedLists:
+        """The lists with the entries `kept` (P,)."""
+        columns, station = self.columns, self.station
+        message = np.repeat(np.arange(len(columns.rows)), columns.rows)[kept]
+        of_rows = {name: getattr(columns, name)[kept] for name in ("object_ix", "class_ix", "values")}
+        own = {n: getattr(self, n)[kept] for n in ("frame_code", "existence", "covariance_m2", "probability")}
+        columns = replace(columns, rows=np.bincount(message, minlength=len(columns.rows)), **of_rows)
+        station = station and replace(station, after_s=station.after_s[kept])
+        return replace(self, columns=columns, station=station, **own)
 
 
 def decode_lists(
@@ -295,7 +318,7 @@ class _BatchReader:
         self._description = description
         self._notes: list[str] = []
         self._wanted = WantedPaths(description, definition.offers())
-        self._found: ShreddedMessages = shred_messages(definition, payloads, self._wanted.numbers, self._wanted.texts)
+        self._found = self._wanted.shred(definition, payloads)
         self._names = definition.names
         check_objects(int(np.bincount(ancestor_rows(self._found, self._fields.objects, "")).max(initial=0)))
         self._messages = len(payloads)
@@ -463,8 +486,6 @@ class _BatchReader:
         described, objects = self._description, self._fields.objects
         if described.footprint is not None:
             fit_outlines(values, self._found, objects, self._wanted.path(described.footprint))
-        if (solid := described.solid) is not None:
-            fit_solids(values, *(self.number(p) for p in (solid.kind, *(f"{solid.dimensions}[{k}]" for k in range(2)))))
         if described.largest_of is None:
             return meant
         chosen = find_largest(values, meant, self._found, objects, described.largest_of)
@@ -515,6 +536,15 @@ class _BatchReader:
         covariance: Float = np.stack([self.number(f"{path}[{k}]")[keep] for k in (0, 1, 7)], axis=1)
         covariance[~self._said("covariance")[keep]] = np.nan
         return covariance
+
+    def _station(self, message: Int, keep: Int) -> Station | None:
+        """The station of the messages (F,) and of the objects `keep` (K,)."""
+        within, of = self._description.within, self._found.levels[""]
+        if not self._description.station or within is None:
+            return None
+        self._notes += find("stations", max(len(of.texts[self._wanted.path(within)].words) - 1, 0))
+        place = np.stack([of.numbers["latitude_deg"], of.numbers["longitude_deg"]], axis=1)
+        return Station(place[np.searchsorted(of.parent, message)], self.number("after_s")[keep])
 
     def _with_standing(
         self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float
@@ -576,6 +606,7 @@ class _BatchReader:
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words
         probability = self._classes(keep)
+        station = self._station(kept_message, keep)
         columns = DecodedObjects(
             stamp_ns=stamp_ns,
             stamped=stamped,
@@ -597,6 +628,7 @@ class _BatchReader:
             self._covariance(keep),
             probability,
             ids is not None,
+            station=station,
         )
 
 

@@ -30,6 +30,7 @@ from copem_replay.io.stamps import settle_stamps
 GROUND_TRUTH = "osi3.GroundTruth"
 SENSOR_VIEW = "osi3.SensorView"
 SENSOR_DATA = "osi3.SensorData"
+EMBEDDED_MAP = "osi3.MapAsamOpenDrive"  # of omega-prime, not of OSI
 TRUTH_SCHEMAS = (GROUND_TRUTH, SENSOR_VIEW)
 """Schemas that hold the truth, the one to prefer first."""
 
@@ -42,26 +43,15 @@ _CLASS_OF_TYPE = {3: CLASSES.index("pedestrian"), 4: CLASSES.index("animal")}
 
 # osi_object.proto, MovingObject.VehicleClassification.Type (OSI 3.8); what is not here is `vehicle`
 _NAME_OF_VEHICLE = {
-    2: "car",  # small car
-    3: "car",  # compact car
-    4: "car",  # (medium) car
-    5: "car",  # luxury car
+    **dict.fromkeys((2, 3, 4, 5), "car"),  # small, compact, medium, luxury car
     6: "van",  # (delivery) van
-    7: "truck",  # heavy truck
-    8: "trailer",  # semitrailer
-    9: "trailer",
+    **dict.fromkeys((7, 16, 19), "truck"),  # heavy truck, semitractor, work machine: big, slow, hides others
+    **dict.fromkeys((8, 9), "trailer"),  # semitrailer, trailer
     10: "motorcycle",  # motorbike
-    11: "bicycle",
+    **dict.fromkeys((11, 17, 18), "bicycle"),  # bicycle, stand-up scooter, micromobility device
     12: "bus",
-    13: "other",  # tram
-    14: "other",  # train
+    **dict.fromkeys((13, 14, 20, 21), "other"),  # tram, train, watercraft, aircraft
     15: "pedestrian",  # wheelchair
-    16: "truck",  # semitractor
-    17: "bicycle",  # stand-up scooter
-    18: "bicycle",  # micromobility device
-    19: "truck",  # work machine: big, slow, hides others
-    20: "other",  # watercraft
-    21: "other",  # aircraft
 }
 _CLASS_OF_VEHICLE = {number: CLASSES.index(name) for number, name in _NAME_OF_VEHICLE.items()}
 

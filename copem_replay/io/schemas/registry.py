@@ -30,8 +30,9 @@ class ListSchema:
 
     `name`: that of the schema; ROS 2 types with their `/msg/`. `describe`: `package.module:function`, imported when a
     recording has such lists. The function takes the paths that the messages offer, since definitions differ between
-    releases, and returns a `Description`. `has_ids`: whether an object keeps its id from list to list, so that the
-    lists can be the truth. `stays`: whether what a message holds may stay until another removes it.
+    releases, and returns a `Description`. `has_ids`: whether an object keeps its id from list to list, in places
+    of the log, so that the lists can be the truth. `stays`: whether what a message holds may stay until another
+    removes it.
     """
 
     name: str
@@ -64,6 +65,8 @@ class ListSchema:
 
 
 _FORMATS: Final = "copem_replay.io.schemas.formats"
+_V2X: Final = "copem_replay.io.schemas.v2x"
+_IKA: Final = ("perception_msgs", "ika_perception_msgs")
 _AUTOWARE: Final = ("autoware_perception_msgs", "autoware_auto_perception_msgs")
 _ROWS: Final = (
     *(ListSchema(f"{package}/msg/TrackedObjects", f"{_FORMATS}:autoware") for package in _AUTOWARE),
@@ -74,6 +77,10 @@ _ROWS: Final = (
     ListSchema("visualization_msgs/msg/MarkerArray", f"{_FORMATS}:markers", stays=True),
     ListSchema("foxglove.SceneUpdate", f"{_FORMATS}:description", stays=True),
     ListSchema("foxglove_msgs/msg/SceneUpdate", f"{_FORMATS}:description", stays=True),
+    *(ListSchema(f"{package}/msg/ObjectList", f"{_FORMATS}:perception") for package in _IKA),
+    ListSchema("etsi_its_cpm_ts_msgs/msg/CollectivePerceptionMessage", f"{_V2X}:cpm", has_ids=False),
+    ListSchema("carma_v2x_msgs/msg/SensorDataSharingMessage", f"{_V2X}:sdsm", has_ids=False),
+    ListSchema("j3224_v2x_msgs/msg/SensorDataSharingMessage", f"{_V2X}:sdsm_integers", has_ids=False),
 )
 SCHEMAS: Final = {schema.name: schema for schema in _ROWS}
 GROUP: Final = "copem_replay.list_schema"

@@ -158,20 +158,10 @@ OSI_VERSION = "3.8.0"
 """The version of OSI that is written."""
 
 # osi_object.proto: MovingObject.Type and MovingObject.VehicleClassification.Type by class; −1: not a vehicle
-_OSI_TYPE: dict[str, tuple[int, int]] = {
-    "pedestrian": (3, -1),
-    "animal": (4, -1),
-    "other": (1, -1),
-    "vehicle": (2, 0),
-    "car": (2, 4),
-    "van": (2, 6),
-    "truck": (2, 7),
-    "trailer": (2, 9),
-    "motorcycle": (2, 10),
-    "bicycle": (2, 11),
-    "bus": (2, 12),
-}
-_TYPE, _VEHICLE = np.array([_OSI_TYPE[name] for name in CLASSES]).T
+_OSI_TYPE = {"pedestrian": 3, "animal": 4, "other": 1}
+_OSI_CAR = {"vehicle": 0, "car": 4, "van": 6, "truck": 7, "trailer": 9, "motorcycle": 10, "bicycle": 11, "bus": 12}
+_TYPE = np.array([_OSI_TYPE.get(name, 2) for name in CLASSES])
+_VEHICLE = np.array([_OSI_CAR.get(name, -1) for name in CLASSES])
 _MEASURED, _STALE = 2, 1  # osi_detectedobject.proto: MEASUREMENT_STATE_MEASURED, _OTHER: from an older list only
 
 

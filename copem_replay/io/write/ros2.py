@@ -23,25 +23,14 @@ from copem_replay.io.encodings.column_bytes import (
     split_into_blocks,
     start_offsets,
 )
+from copem_replay.io.schemas.formats import AUTOWARE
 from copem_replay.io.write.scene import pose_content
 
 DETECTED_OBJECTS = "autoware_perception_msgs/msg/DetectedObjects"
 TRACKED_OBJECTS = "autoware_perception_msgs/msg/TrackedObjects"
 
-LABELS = {
-    "pedestrian": 7,
-    "bicycle": 6,
-    "motorcycle": 5,
-    "car": 1,
-    "van": 1,  # car: Autoware has no label for vans
-    "truck": 2,
-    "bus": 3,
-    "trailer": 4,
-    "animal": 8,
-    "other": 0,
-    "vehicle": 0,  # unknown: nor one for a vehicle of any kind
-}
-"""ObjectClassification.label by class."""
+LABELS = {name: int(label) for label, name in AUTOWARE.items()} | {"van": 1, "other": 0, "vehicle": 0}
+"""ObjectClassification.label by class: a van is a car, for it has no label of vans, nor of vehicles of any kind."""
 _LABEL = np.array([LABELS[name] for name in CLASSES])
 _BOUNDING_BOX, _CYLINDER = 0, 1  # Shape.type
 _AVAILABLE = 2  # DetectedObjectKinematics: the orientation is known in full

@@ -29,6 +29,7 @@ from copem_replay.io.containers.mcap_records import (
 )
 from copem_replay.io.containers.osi_trace import TraceLog
 from copem_replay.io.containers.rosbag2 import BagLog
+from copem_replay.io.containers.sqlite import SqliteLog
 from copem_replay.io.log import BrokenIndexError, Log, open_file
 from copem_replay.io.open import JoinedLog, Local, open_log
 from copem_replay.io.schemas.osi_ground_truth import load_message_class
@@ -137,7 +138,7 @@ def _list_files(log: Log) -> Iterator[Log]:
 
 def _read_records(log: Log) -> list[McapRecord]:
     """The header, the metadata records and the attachments of a file. Raises BrokenIndexError."""
-    if isinstance(log, TraceLog):
+    if isinstance(log, TraceLog | SqliteLog):
         return []
     with open_file(log.path) as file:
         if not log.indexed:

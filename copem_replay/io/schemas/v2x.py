@@ -1,0 +1,232 @@
+"""The formats of object lists that stations send: CPM of ETSI, SDSM of SAE. They can be lists of a unit, not the truth.
+
+Positions are relative to the station; numbers are whole ones, and some of them mean that nothing is known.
+Sources: ETSI TS 103 324 and TS 102 894-2 V2.1.1, as `etsi_its_cpm_ts_msgs` has them; SAE J3224 and J2735, as
+`j3224_v2x_msgs` has them, and as `carma_v2x_msgs` has them in m, s and degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Final
+
+import numpy as np
+
+from copem_replay.core.tracks import Bool, Float
+from copem_replay.io.schemas.description import ClassField, Description, Fields, Made, Stamp
+
+_SIGMAS_95: Final = 1.959963984540054
+"""Half the width of the interval that holds 95 % of a normal distribution, in standard deviations."""
+
+
+def _scale(per: float, *none: float, flagged: bool = True) -> Callable[..., Float]:
+    """What makes numbers of whole ones, `per` of them one unit; NaN: one of `none`, or a flag is not as `flagged`."""
+
+    def make(whole: Float, *flags: Float) -> Float:
+        known = ~np.isin(whole, none)
+        for flag in flags:
+            known &= (flag != 0) == flagged
+        return np.where(known, whole / per, np.nan)
+
+    return make
+
+
+def _describe(
+    objects: str, ident: str, within: str, class_: str, names: dict[int, str], share: str | None, made: dict[str, Made]
+) -> Description:
+    """The description of lists whose columns `made` has, with one path of the confidence along each axis."""
+    columns = ("x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "covariance")
+    kind = ClassField(path=class_, map={str(number): name for number, name in names.items()}, probability=share)
+    fields = {"objects": objects, "stamp": Stamp(path="stamp_ms", unit="ms"), "id": ident, "class": kind}
+    make_yaw, *of_yaw = made["yaw_rad"]
+    made |= {
+        "yaw_said": (lambda *of: np.isfinite(make_yaw(*of)), *of_yaw),
+        "yaw_rad": (lambda *of: np.nan_to_num(make_yaw(*of)), *of_yaw),
+        "covariance[1]": (np.zeros_like, made["covariance[0]"][1]),  # variances alone
+    }
+    fields |= {name: name for name in columns}
+    return Description(Fields.model_validate(fields), within=within, said={"yaw": "yaw_said"}, made=made, station=True)
+
+
+# CPM.
+
+_ITS_EPOCH_S: Final = 1_072_915_200
+"""The begin of 2004 (UTC) in Unix time: times of ITS are counted from there."""
+_LEAPS_S: Final = (1_136_073_600, 1_230_768_000, 1_341_100_800, 1_435_708_800, 1_483_228_800)
+"""Ends of the leap seconds since in Unix time, which does not count them; time of ITS does."""
+_CPM_CLASSES: Final = {
+    **dict(enumerate(("vehicle", "pedestrian", "bicycle", "motorcycle", "motorcycle", "car", "bus", "van", "truck"))),
+    **dict(enumerate(("trailer", "vehicle", "other", "bicycle", "animal", "vehicle"), 9)),
+    **dict(enumerate(("pedestrian", "bicycle", "motorcycle", "animal"), 1000)),
+    **{2000: "other", 3000: "other"},
+}
+"""TrafficParticipantType; 1000: VruProfileAndSubprofile; a group of road users, another thing."""
+
+
+def convert_its_time(its_ms: Float) -> Float:
+    """Unix time in ms of TimestampIts: ms since the begin of 2004, leap seconds counted."""
+    ends_ms = [(end_s - _ITS_EPOCH_S + k) * 1000 for k, end_s in enumerate(_LEAPS_S, 1)]
+    return its_ms + (_ITS_EPOCH_S - np.searchsorted(ends_ms, its_ms, side="right")) * 1000.0
+
+
+def _cpm_velocity(turn: Callable[[Float], Float]) -> Callable[..., Float]:
+    """What makes a velocity along an axis: of a speed and its direction (choice 0), or of that along the axis."""
+
+    def make(stated: Float, choice: Float, speed: Float, direction: Float, along: Float) -> Float:
+        polar = _scale(100, 16382, 16383)(speed) * turn(np.deg2rad(_scale(10, 3600, 3601)(direction)))
+        velocity = np.where(choice == 0, polar, _scale(100, -16383, 16382, 16383)(along))
+        return np.where(stated != 0, velocity, np.nan)
+
+    return make
+
+
+def _cpm_class(choice: Float, vehicle: Float, person: Float) -> Float:
+    return 1000 * choice + np.where(choice == 0, vehicle, np.where(choice == 1, person, 0))
+
+
+def cpm(offers: Collection[str]) -> Description:
+    """CollectivePerceptionMessage: the objects of its containers, positions as east and north of the station."""
+    management, of_class, speed = "/payload.management_container", "classification.array[]", "velocity.polar_velocity"
+    objects = "perceived_object_container.perceived_objects.array[]"
+    objects = f"payload.cpm_containers.value.array[].container_data_{objects}"
+    kind, along, angle = f"{of_class}.object_class", "velocity.cartesian_velocity", "angles.z_angle.value.value"
+    speed_of = (f"{speed}.velocity_magnitude.speed_value.value", f"{speed}.velocity_direction.value.value")
+    fast = ("velocity_is_present", "velocity.choice", *speed_of)
+    made: dict[str, Made] = {
+        "/stamp_ms": (convert_its_time, f"{management}.reference_time.value"),
+        "/latitude_deg": (_scale(1e7), f"{management}.reference_position.latitude.value"),
+        "/longitude_deg": (_scale(1e7), f"{management}.reference_position.longitude.value"),
+        "after_s": (_scale(1000), "measurement_delta_time.value"),
+        "yaw_rad": (lambda *of: np.deg2rad(_scale(10, 3600, 3601)(*of)), angle, "angles_is_present"),
+        "vx_mps": (_cpm_velocity(np.cos), *fast, f"{along}.x_velocity.value.value"),
+        "vy_mps": (_cpm_velocity(np.sin), *fast, f"{along}.y_velocity.value.value"),
+        f"{of_class}.class": (
+            _cpm_class, f"{kind}.choice", f"{kind}.vehicle_sub_class.value", f"{kind}.vru_sub_class.choice",
+        ),
+        f"{of_class}.share": (lambda of: np.where(of > 100, 1.0, of / 100), f"{of_class}.confidence.value"),
+    }  # fmt: skip
+    for place, axis in {0: "x", 7: "y"}.items():
+        at = f"position.{axis}_coordinate"
+        made[f"{axis}_m"] = (_scale(100, -131072, 131071), f"{at}.value.value")
+        made[f"covariance[{place}]"] = (
+            lambda of: (_scale(100, 0, 4095, 4096)(of) / _SIGMAS_95) ** 2, f"{at}.confidence.value",
+        )  # fmt: skip
+    for side, axis in {"length": "x", "width": "y", "height": "z"}.items():
+        size = f"object_dimension_{axis}"
+        made[f"{side}_m"] = (_scale(10, 0, 255, 256), f"{size}.value.value", f"{size}_is_present")
+    path, share = f"{of_class}.class", f"{of_class}.share"
+    return _describe(objects, "object_id.value", "/header.station_id.value", path, _CPM_CLASSES, share, made)
+
+
+# SDSM.
+
+_NEAR_M = np.array([np.nan, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01])
+"""PositionConfidence: as near is a position, along each axis, with 95 %."""
+_SDSM_CLASSES: Final = {
+    **dict(enumerate(("other", "vehicle", "pedestrian", "animal"))),  # ObjectType, where it says no more
+    **{1010: "car", 1011: "car", 1020: "van", 1021: "van"},
+    **dict.fromkeys(range(1025, 1036), "truck"),
+    **dict.fromkeys(range(1040, 1049), "motorcycle"),
+    **dict.fromkeys(range(1050, 1059), "bus"),
+    **dict.fromkeys((1001, *range(1060, 1070)), "vehicle"),
+    **dict(enumerate(("pedestrian", "bicycle", "pedestrian", "animal"), 2001)),
+}
+"""1000: BasicVehicleClass; 2000: PersonalDeviceUserType."""
+_VEHICLE, _PERSON, _OBSTACLE = 0, 1, 2
+_TIME = ("presence_vector", "year.year", "month.month", "day.day", "hour.hour", "minute.minute", "second.millisecond")
+_HAS_TIME, _HAS_ZONE, _HAS_SIZE, _HAS_HEIGHT, _HAS_CLASS = 63, 64, 32, 64, 256
+"""Bits of presence: of all parts of a time, and its zone; of the size, height and class of a vehicle."""
+
+
+def _has(flags: Float, bits: int) -> Bool:
+    result: Bool = (flags.astype(np.int64) & bits) == bits
+    return result
+
+
+def _sdsm_time(has: Float, year: Float, month: Float, day: Float, *of_day: Float) -> Float:
+    """Unix time in ms of DDateTime; NaN: a part is missing, or is none."""
+    hour, minute, second_ms, zone_min = of_day
+    known = _has(has, _HAS_TIME) & (year > 0) & (second_ms < 61_000)
+    months = (np.where(known, year, 1970).astype(np.int64) - 1970) * 12 + month.astype(np.int64) - 1
+    days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.float64) + day - 1
+    minutes = days * 1440 + hour * 60 + minute - np.where(_has(has, _HAS_ZONE), zone_min, 0)
+    return np.where(known, minutes * 60_000 + second_ms, np.nan)
+
+
+def _sdsm_class(kind: Float, has: Float, choice: Float, of_vehicle: Float, of_person: Float, *which: Float) -> Float:
+    """The class that a vehicle or a person states, else the kind of object."""
+    vehicle, person = which
+    as_vehicle = _has(has, 1) & (choice == _VEHICLE) & _has(of_vehicle, _HAS_CLASS) & (vehicle > 0)
+    as_person = _has(has, 1) & (choice == _PERSON) & _has(of_person, 1) & (person > 0)
+    return np.where(as_vehicle, 1000 + vehicle, np.where(as_person, 2000 + person, kind))
+
+
+def _sdsm_size(bit: int, per: float, per_obstacle: float) -> Callable[..., Float]:
+    """What makes the size of a vehicle that has the flag `bit`, or of an obstacle."""
+
+    def make(has: Float, choice: Float, of_vehicle: Float, vehicle: Float, obstacle: Float) -> Float:
+        as_vehicle = _has(has, 1) & (choice == _VEHICLE) & _has(of_vehicle, bit)
+        as_obstacle = _has(has, 1) & (choice == _OBSTACLE)
+        return np.where(as_vehicle, vehicle / per, np.where(as_obstacle, obstacle / per_obstacle, np.nan))
+
+    return make
+
+
+def sdsm(offers: Collection[str]) -> Description:
+    """SensorDataSharingMessage in m, s and degrees, with flags for what is unavailable."""
+    return _describe_sdsm(1, 1, 1, 1, 1, 1, 1, "unavailable")
+
+
+def sdsm_integers(offers: Collection[str]) -> Description:
+    """SensorDataSharingMessage in the units of J3224."""
+    return _describe_sdsm(1e7, 1000, 10, 50, 80, 100, 20)
+
+
+def _describe_sdsm(
+    per_deg: float, per_s: float, per_m: float, per_mps: float, per_turn: float, per_side: float, per_height: float,
+    *flags: str,
+) -> Description:  # fmt: skip
+    """The description of messages with so many units for a degree of the place, an s, an m, an m/s, a degree of the
+    heading, an m of the side of a vehicle and of its height.
+
+    Offsets are north and east of the station, as CARMA reads them. A measurement is before its message, whatever the
+    sign of its time: writers differ.
+    """
+    common, optional = "detected_object_common_data", "detected_object_optional_data"
+    vehicle, person, obstacle = (f"{optional}.{name}" for name in ("det_veh", "det_vru", "det_obst"))
+    heading, speed = ([f"{common}.{name}.{of}" for of in (name, *flags)] for name in ("heading", "speed"))
+    fast, turn = _scale(per_mps, 8191, flagged=False), _scale(per_turn, 28800, flagged=False)
+    has, count = ("presence_vector", f"{optional}.choice"), len(speed)
+
+    def yaw(*of: Float) -> Float:
+        return np.deg2rad(90 - turn(*of))
+
+    def variance(of: Float) -> Float:
+        return np.square(_NEAR_M[np.where(of < len(_NEAR_M), of, 0).astype(np.int64)] / _SIGMAS_95)
+
+    made: dict[str, Made] = {
+        "/stamp_ms": (_sdsm_time, *(f"/sdsm_time_stamp.{part}" for part in (*_TIME, "offset.offset_minute"))),
+        "/latitude_deg": (_scale(per_deg), "/ref_pos.latitude"),
+        "/longitude_deg": (_scale(per_deg), "/ref_pos.longitude"),
+        "after_s": (lambda of: -np.abs(of) / per_s, f"{common}.measurement_time.measurement_time_offset"),
+        "x_m": (_scale(per_m), f"{common}.pos.offset_y.object_distance"),
+        "y_m": (_scale(per_m), f"{common}.pos.offset_x.object_distance"),
+        "yaw_rad": (yaw, *heading),
+        "vx_mps": (lambda *of: fast(*of[:count]) * np.cos(yaw(*of[count:])), *speed, *heading),
+        "vy_mps": (lambda *of: fast(*of[:count]) * np.sin(yaw(*of[count:])), *speed, *heading),
+        "covariance[0]": (variance, f"{common}.pos_confidence.pos.confidence"),
+        "covariance[7]": (variance, f"{common}.pos_confidence.pos.confidence"),
+        "class": (
+            _sdsm_class, f"{common}.obj_type.object_type", *has, f"{vehicle}.presence_vector",
+            f"{person}.presence_vector", f"{vehicle}.vehicle_class.basic_vehicle_class", f"{person}.basic_type.type",
+        ),
+    }  # fmt: skip
+    for side, of, bit, per in (
+        ("length", "size.vehicle_length", _HAS_SIZE, per_side),
+        ("width", "size.vehicle_width", _HAS_SIZE, per_side),
+        ("height", "height.vehicle_height", _HAS_HEIGHT, per_height),
+    ):
+        paths = (f"{vehicle}.presence_vector", f"{vehicle}.{of}", f"{obstacle}.obst_size.{side}.size_value")
+        made[f"{side}_m"] = (_sdsm_size(bit, per, per_m), *has, *paths)
+    ident, objects = f"{common}.detected_id.object_id", "objects.detected_object_data[]"
+    return _describe(objects, ident, "/source_id.id", "class", _SDSM_CLASSES, None, made)

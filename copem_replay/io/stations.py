@@ -1,0 +1,87 @@
+"""Lists of stations (CPM, SDSM): brought from their station into the log, and their times.
+
+A list is captured when most of its objects were measured, and arrives when it was logged: a station sends no time of
+arrival. Objects that were measured at other times are moved to the capture along their velocity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from copem_replay.core.errors import InputError, RecordingError, count_noun
+from copem_replay.core.frame import Frame
+from copem_replay.core.tracks import Bool, Int
+from copem_replay.io.findings import VX, VY, find
+from copem_replay.io.frames import SampledPoses, transform_rows
+from copem_replay.io.ground_truth import take_messages
+from copem_replay.io.schemas.object_lists import DecodedLists, Station
+from copem_replay.io.stamps import SLACK_NS
+
+
+def place_on_earth(lists: DecodedLists, station: Station, frame: Frame | None, path: Path, topic: str) -> DecodedLists:
+    """The lists in metres of the log, which has the `frame`; those whose station has no place are left out.
+
+    Raises RecordingError, naming `path` and `topic`: the log has no frame, no list has a place, or one out of reach.
+    """
+    if frame is None:
+        why = "its positions are relative to stations on earth, and the log does not say where it is"
+        raise RecordingError(f"{why}: give `frame: {{proj: …}}` (docs/guide/place.md)", path=path, topic=topic)
+    known: Bool = np.all(np.abs(station.place) <= (90.0, 180.0), axis=1)
+    if len(known) and not known.any():
+        missing = count_noun(len(known), "message")
+        raise RecordingError(f"none of its {missing} has the reference position of its station", path=path, topic=topic)
+    lists = _take_messages(lists, known)
+    places, place = np.unique(station.place[known], axis=0, return_inverse=True)
+    try:
+        at_m = frame.from_wgs84(places)
+    except InputError as error:
+        raise RecordingError("; ".join(error.problems), path=path, topic=topic) from None
+    turns = [np.deg2rad(frame.convergence_deg(*at)) - frame.yaw_rad for at in places]
+    half, zero = np.array(turns, dtype=float) / 2, np.zeros(len(places))
+    rotation = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+    placed = SampledPoses(np.ones(len(places), dtype=bool), np.column_stack([at_m, zero]), rotation)
+    instant, values = np.repeat(place.reshape(-1), lists.columns.rows), lists.columns.values.copy()
+    values[:, :2] *= np.array([frame.scale(*at) for at in places], dtype=float)[instant, None]
+    values, covariance = transform_rows(values, lists.covariance_m2, placed, instant)
+    notes = (*lists.columns.notes, *find("no station", int((~known).sum())))
+    return replace(lists, columns=replace(lists.columns, values=values, notes=notes), covariance_m2=covariance)
+
+
+def _take_messages(lists: DecodedLists, kept: Bool) -> DecodedLists:
+    """The lists `kept` (F,)."""
+    lists = lists.take_rows(np.repeat(kept, lists.columns.rows))
+    return replace(lists, columns=take_messages(lists.columns, kept))
+
+
+def settle_measurements(
+    lists: DecodedLists, t0_ns: int, path: Path, topic: str
+) -> tuple[DecodedLists, tuple[Int, Bool]]:
+    """The lists of stations with their objects at one capture each, (F,) captures, and whether these are stated.
+
+    Stamps are arrivals then. Where the stations' clock is not that of the times of logging, these are taken: captures
+    are not stated then. Lists captured more than a second before `t0_ns` are left out. Raises RecordingError: all are.
+    """
+    columns, notes = lists.columns, list(lists.columns.notes)
+    measured_s = np.zeros(0) if lists.station is None else lists.station.after_s
+    apart_ns = np.sort((columns.log_time_ns - columns.stamp_ns)[columns.stamped])
+    median_ns = int(apart_ns[len(apart_ns) // 2]) if len(apart_ns) else 0
+    said = columns.stamped & (abs(median_ns) <= SLACK_NS)
+    notes += find("station clock", int((columns.stamped & ~said).sum()), apart=median_ns * 1e-9)
+    middles = (np.sort(of)[(len(of) - 1) // 2 :] for of in np.split(measured_s, np.cumsum(columns.rows)[:-1]))
+    after_s = np.array([middle[0] if len(middle) else 0.0 for middle in middles])
+    away_s = np.repeat(after_s, columns.rows) - measured_s
+    values = columns.values.copy()
+    values[:, :2] += away_s[:, None] * np.nan_to_num(values[:, VX : VY + 1])
+    notes += find("measured apart", int((away_s != 0).sum()), most=float(np.abs(away_s).max(initial=0.0)))
+    captured_ns = np.where(said, columns.stamp_ns, columns.log_time_ns) + np.rint(after_s * 1e9).astype(np.int64)
+    kept = captured_ns >= t0_ns - SLACK_NS
+    if len(kept) and not kept.any():
+        older = f"all of its {count_noun(len(kept), 'message')} are older than the log"
+        before_s = (t0_ns - captured_ns.max()) * 1e-9
+        raise RecordingError(f"{older}, the last one by {before_s:.3g} s", path=path, topic=topic)
+    notes += find("older", int((~kept).sum()))
+    arrived = replace(columns, values=values, stamp_ns=columns.log_time_ns, notes=tuple(notes))
+    return _take_messages(replace(lists, columns=arrived), kept), (captured_ns[kept], said[kept])
