@@ -112,8 +112,8 @@ measure: {objects: {classes: [pedestrian]}, onset: {kind: in_range, range_m: 30}
     ("walkers", "expected"),
     [
         ({2: (40, 1), 3: (55, 1)}, {"ahead": "3"}),
-        ({2: (40, 1), 3: (55, 1), 4: (40, -1)}, {"ahead": "3", "behind": ""}),
-        ({2: (40, 1), 4: (35, -1)}, {"ahead": "2", "behind": "4"}),
+        ({2: (40, 1), 3: (55, 1), 4: (40, -1)}, {"ahead for 4.0 s, behind for 2.0 s": "3"}),
+        ({2: (40, 1), 4: (35, -1)}, {"ahead for 2.0 s, behind for 2.0 s": "2"}),
     ],
 )
 def test_the_example_is_one_that_the_viewer_shows(

@@ -226,3 +226,22 @@ def test_exact_times_are_refused(tmp_path: Path) -> None:
     }  # fmt: skip
     with pytest.raises(ExperimentError, match="unit 'mast' fuses the lists of others, which has no closed form"):
         cr.load_experiment(plan)
+
+
+def test_another_fusion_gets_the_lists_of_a_hub_from_the_file(tmp_path: Path) -> None:
+    path = line(tmp_path / "line.mcap", from_s=0.3)
+    error = {"kind": "gaussian", "covariance_m2": [[0.2, 0.05], [0.05, 0.1]]}
+    pem = {"couples": [{"detection": {"kind": "constant", "probability": 0.7}, "error": error}]}
+    units = {"car": {"on": "ego", "pem": "p"}, "hub": {"fuses": ["a", "b"], "fusion": {"kind": "gnn"}}}
+    gnn = {"gnn": {"units": ["car", "hub"], "fusion": {"kind": "gnn"}}}
+    plan = {"version": 1, "logs": [str(path)], "pems": {"p": pem}, "units": TWO | units, "configurations": gnn}
+    cr.run(plan).save(tmp_path / "r")
+    again = {name: {"recorded": {"topic": f"copem/units/{name}/objects"}} for name in units}
+    before, after = (
+        tracks(log, {"pems": {"p": pem}, "units": of, "configurations": gnn})["gnn"].to_dataframe()
+        for log, of in ((path, TWO | units), (tmp_path / "r/replay.mcap", again))
+    )
+    order, left_out = ["available_s", "x_m", "y_m"], ["track_id"]
+    before, after = (of.drop(columns=left_out).sort_values(order, ignore_index=True) for of in (before, after))
+    assert len(before) > 20
+    pd.testing.assert_frame_equal(before, after, rtol=0, atol=1e-9)
