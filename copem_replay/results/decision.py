@@ -464,7 +464,7 @@ def _explain_braking(results: Results | None, names: Collection[str]) -> str:
         return ""
     rows = results.frame(NEEDLESS)
     lasts_s = rows[rows["configuration"].isin(names)].groupby("cause")["lasts_s"].sum()
-    return f" mostly because of {_CAUSES[str(lasts_s.idxmax())]}"
+    return f" mostly because of {_CAUSES[str(lasts_s.idxmax())]}" if len(lasts_s) else ""
 
 
 def _format_share(share: float) -> str:

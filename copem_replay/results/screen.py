@@ -72,7 +72,7 @@ def format_screen(results: Results, summary: pd.DataFrame, best: Sequence[str]) 
     headers, groups = zip(*((column.header, column.group) for column in columns), strict=True)
     lines, marked = tabulate_alike(rows, headers, best, groups=groups, more_in="summary.csv")
     none = describe_no_needless(summary) if SHARE in summary else None
-    false = [] if FALSE not in shown else _tell_false(results, shown.set_index("configuration")[FALSE])
+    false = [] if FALSE not in shown else _tell_false(results, shown.set_index("configuration")[FALSE].astype(float))
     return [*_describe_rows(results), *lines, *false, *([] if none is None else [none]), ""], marked
 
 

@@ -84,8 +84,8 @@ def _format_points(row: Any) -> str:
     if row[["interval_over", "low", "high"]].isna().any():
         return f"{shown}, without an interval"
     logs = "" if pd.isna(row["logs_better"]) else f", {describe_gain(row)}"
-    unsure = row["low"] <= NOTHING and row["high"] >= -NOTHING
-    shown += f" {write_limits(100 * row['low'], 100 * row['high'])}{logs}"
+    low, high = 100 * row["low"], 100 * row["high"]
+    unsure, shown = low <= NOTHING and high >= -NOTHING, f"{shown} {write_limits(low, high)}{logs}"
     return shown + ": the interval includes 0, so no difference can be shown" * bool(unsure)
 
 
