@@ -15,6 +15,7 @@ from copem_replay.cli.terminal import (
     ResultsFolder,
     print_answer,
     print_blocks,
+    print_first_notes,
     print_line,
     print_notes,
     print_rows,
@@ -104,7 +105,8 @@ def compare(
 
         drawn = names if names or not comparison.newer else [*comparison.changed.configurations] or None
         notes += write_side_by_side(rrd, folders, configurations=drawn, baseline=baseline, log=log, run=run)
-    print_notes(() if as_json else notes)
+    if not as_json:
+        print_notes(notes) if whole else print_first_notes(notes, "--explain")
     if comparison.newer:
         head, told, marked = tell_change(comparison)
         answer: tuple[str, ...] = (told,)

@@ -10,6 +10,7 @@ import sys
 import time
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO, TypeAlias, TypeVar
 
@@ -156,15 +157,16 @@ def print_notes(lines: Iterable[str]) -> None:
 
 
 MOST_NOTES = 4
-"""More lines are not read: the rest is in `info` and in the results."""
+"""Lines of notes: more are not read, the rest is in `info` and in the results."""
 
 
-def print_first_notes(lines: Sequence[str]) -> None:
-    """Print the first notes on stderr, and where the others are."""
-    print_notes(lines[:MOST_NOTES])
-    if len(lines) > MOST_NOTES:
-        more = len(lines) - MOST_NOTES
-        print_problems([f"and {count_noun(more, 'more note')}: `copem-replay info LOG`, and read.csv of the results"])
+def print_first_notes(lines: Sequence[str], others: str = "`copem-replay info LOG`, read.csv of the results") -> None:
+    """Print the first notes on stderr, one at least, and where the `others` are."""
+    ends = accumulate(len(wrap_line(f"note: {line}", width_of(sys.stderr))) for line in lines)
+    shown = max(1, sum(end <= MOST_NOTES for end in ends))
+    print_notes(lines[:shown])
+    if (more := len(lines) - shown) > 0:
+        print_problems([f"and {count_noun(more, 'more note')}: {others}"])
 
 
 def print_verdicts(verdicts: Judgement) -> None:

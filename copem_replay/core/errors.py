@@ -16,6 +16,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import math
 import os
 import re
 import textwrap
@@ -171,6 +172,13 @@ def quote_value(value: object) -> str:
 def count_noun(number: int, noun: str, plural: str = "") -> str:
     """`1 message`, `2 messages`; `plural` where it is not the noun with an s."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def name_first(names: Sequence[str], most: int, room: float = math.inf) -> str:
+    """`a, b and 3 more`: the first `most` names; fewer, one at least, where that would take over `room` characters."""
+    kept = range(min(most, len(names)), 0, -1)
+    told = [", ".join(names[:k]) + f" and {len(names) - k} more" * (k < len(names)) for k in kept]
+    return next((words for words in told if len(words) <= room), told[-1] if told else "")
 
 
 def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:

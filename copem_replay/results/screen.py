@@ -8,63 +8,52 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
 
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import count_noun, name_first
 from copem_replay.metrics.braking.driving import SHARE
+from copem_replay.metrics.columns import FALSE_TRACKS
 from copem_replay.metrics.limits import FEWEST_CLUSTERS, count_clusters, describe_clusters, format_limit, format_limits
 from copem_replay.metrics.onset import has_frame_after
 from copem_replay.metrics.summary import describe_no_needless
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.limits import STAR
 from copem_replay.results.compare.tables import NOTHING, explain_no_interval
-from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE, tell_seconds
+from copem_replay.results.decision import MATTERS, tell_seconds
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
     from copem_replay.results.read import Results
 
-_MOST_ROWS = 12
-"""More configurations are in `summary.csv`."""
+FALSE = "false_positives_per_min"
+_MOST_ROWS, _MOST_CHANGES = 12, 5
+"""Rows of a table, and of one of old and new; more configurations are in `summary.csv`, or shown by `--explain`."""
 _NAMES = 26
 """Most characters of the names of configurations that share a row."""
 
 
-def _seconds(value: float) -> str:
-    return f"{value:.2f}"
-
-
-def _metres(value: float) -> str:
-    return f"{value:.1f}"
-
-
-def _per_cent(value: float) -> str:
-    return f"{100 * value:.3g} %"
-
-
-@dataclass(frozen=True)
-class _Column:
-    """`group`: words above neighbouring columns."""
+class _Column(NamedTuple):
+    """`group`: words above neighbouring columns; `format`: of the value, of shares per cent."""
 
     group: str
     header: str
     metric: str
-    format: Callable[[float], str]
+    format: str = "{:.3g} %"
     never: str = "–"
 
 
 _COLUMNS = (
-    _Column("known after, s", "mean", "ttd_rmst_s", _seconds, "never"),
-    _Column("known after, s", "median", "ttd_median_s", _seconds, "never"),
-    _Column("known after, s", "95 % by", "ttd_p95_s", _seconds, "never"),
-    _Column("at distance, m", "median", "dad_median_m", _metres),
-    _Column("", "detected", "detected_share", _per_cent),
-    _Column("conflicts", "passed", "pass_share", _per_cent),
-    _Column("braking", "for nothing", SHARE, _per_cent),
+    _Column("known after, s", "mean", "ttd_rmst_s", "{:.2f}", "never"),
+    _Column("known after, s", "median", "ttd_median_s", "{:.2f}", "never"),
+    _Column("known after, s", "95 % by", "ttd_p95_s", "{:.2f}", "never"),
+    _Column("at distance, m", "median", "dad_median_m", "{:.1f}"),
+    _Column("", "detected", "detected_share"),
+    _Column("conflicts", "passed", "pass_share"),
+    _Column("braking", "for nothing", SHARE),
 )
 
 
@@ -77,19 +66,24 @@ def format_screen(results: Results, summary: pd.DataFrame, best: Sequence[str]) 
         return [*_describe_rows(results)][:1], []
     shown = summary[[not _is_trivial(results, row) for _, row in summary.iterrows()]]
     columns = [column for column in _COLUMNS if column.metric in shown and _is_told(shown[column.metric], column)]
-    rows: dict[tuple[str, ...], list[str]] = {}
-    for _, row in shown.iterrows():
-        cells = tuple(_format_cell(row, column) for column in columns)
-        rows.setdefault(cells, []).append(str(row["configuration"]))
-    names = {cells: _join_names(of) for cells, of in rows.items()}
-    kept = list(rows)[:_MOST_ROWS]
-    lines = _format_table(columns, [(names[cells], *cells) for cells in kept])
-    marked = [line for line, cells in zip(lines[2:], kept, strict=True) if {*rows[cells]} & {*best}]
-    left = sum(len(rows[cells]) for cells in list(rows)[_MOST_ROWS:])
-    more = [f"and {left} more in summary.csv"] if left else []
+    rows = (
+        (str(row["configuration"]), [_format_cell(row, column) for column in columns]) for _, row in shown.iterrows()
+    )
+    headers, groups = zip(*((column.header, column.group) for column in columns), strict=True)
+    lines, marked = tabulate_alike(rows, headers, best, groups=groups, more_in="summary.csv")
     none = describe_no_needless(summary) if SHARE in summary else None
-    more += [none] if none is not None else []
-    return [*_describe_rows(results), *lines, *more, ""], marked
+    false = [] if FALSE not in shown else _tell_false(results, shown.set_index("configuration")[FALSE].astype(float))
+    return [*_describe_rows(results), *lines, *false, *([] if none is None else [none]), ""], marked
+
+
+def _tell_false(results: Results, per_min: pd.Series) -> list[str]:
+    """Who lists entries about nobody, `per_min` by configuration, where that is worth a look, and for how long."""
+    if not len(rates := per_min[per_min >= MATTERS[FALSE]].sort_values(ascending=False, kind="stable")):
+        return []
+    told = name_first([f"{name} {format_limit(rate)}" for name, rate in rates.items()], len(rates), _WIDE - 44)
+    tracks = results.frame(FALSE_TRACKS)
+    longest_s = tracks.loc[tracks["configuration"].isin(rates.index), "lasts_s"].max()
+    return [f"False per minute: {told}; none lasts over {longest_s:.2g} s."]
 
 
 def _is_trivial(results: Results, row: Any) -> bool:
@@ -104,35 +98,37 @@ def _is_told(values: pd.Series, column: _Column) -> bool:
 
 def _format_cell(row: Any, column: _Column) -> str:
     value = row[column.metric]
-    return column.never if value is None or pd.isna(value) else column.format(float(value))
+    return column.never if pd.isna(value) else column.format.format(value * (100 if "share" in column.metric else 1))
 
 
-def _join_names(names: Sequence[str], room: int = _NAMES) -> str:
-    """`gnn, union`; `gnn and 3 more` where they do not fit."""
-    whole = ", ".join(names)
-    return whole if len(whole) <= room or len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+def tabulate_alike(
+    rows: Iterable[tuple[str, Sequence[str]]], headers: Sequence[str], best: Sequence[str] = (), *,
+    groups: Sequence[str] = (), pad: Callable[[str, int], str] = str.rjust, more_in: str = "--explain",
+    most: int = _MOST_ROWS,
+) -> tuple[list[str], list[str]]:  # fmt: skip
+    """Configurations and their cells in columns of equal width, those with the same cells in one row, of many the
+    first; and the lines that have one of the `best`.
 
-
-def _format_table(columns: Sequence[_Column], rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Two lines of headers, then the rows; numbers to the right."""
-    headers = ["", *(column.header for column in columns)]
-    widths = [max(map(len, cells)) for cells in zip(headers, *rows, strict=True)]
-    groups, k = [" " * widths[0]], 0
-    while k < len(columns):
-        after = k
-        while after < len(columns) and columns[after].group == columns[k].group:
-            after += 1
-        width = sum(widths[k + 1 : after + 1]) + 2 * (after - k - 1)
-        if (grow := len(columns[k].group) - width) > 0:
-            widths[k + 1] += grow
-            width += grow
-        groups.append(columns[k].group.rjust(width))
-        k = after
-    body = [
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
-        for row in (headers, *rows)
-    ]
-    return ["  ".join(groups).rstrip(), *(line.rstrip() for line in body)]
+    `groups`: words above each column; alike ones that are neighbours stand there once. `more_in`: where the others are.
+    """
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for name, cells in rows:
+        alike.setdefault(tuple(cells), []).append(name)
+    shown = [*alike.items()][:most]
+    table = [("", *headers), *((name_first(names, _NAMES, _NAMES), *cells) for cells, names in shown)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    above, after = [" " * widths[0]], 1
+    for group, of_group in groupby(groups):
+        first, after = after, after + len([*of_group])
+        width = sum(widths[first:after]) + 2 * (after - first - 1)
+        widths[first] += max(0, len(group) - width)
+        above.append(group.rjust(width))
+    padded = ([row[0].ljust(widths[0]), *map(pad, row[1:], widths[1:])] for row in table)
+    head, *lines = ["  ".join(cells).rstrip() for cells in padded]
+    marked = [line for line, (_, names) in zip(lines, shown, strict=True) if {*names} & {*best}]
+    left = sum(len(names) for names in [*alike.values()][most:])
+    more = [f"and {left} more: {more_in}"] if left else []
+    return [*(["  ".join(above).rstrip()] if groups else []), head, *lines, *more], marked
 
 
 def _describe_rows(results: Results) -> Iterator[str]:
@@ -140,9 +136,7 @@ def _describe_rows(results: Results) -> Iterator[str]:
     logs, objects, passes = count_clusters(results.known)
     runs, names = results.provenance.runs, [log.name for log in results.provenance.logs]
     where = names[0] if len(names) == 1 else count_noun(len(names), "log")
-    counted = count_noun(objects, "object") + (
-        f" in {count_noun(passes, 'pass', 'passes')}" if passes > objects else ""
-    )
+    counted = describe_counted(objects, passes)
     verb = "counts" if objects == 1 else "count"
     yield f"{where}: {counted} {verb}, {count_noun(runs, 'run')}{_describe_left_out(results)}"
     if objects == 1 and passes < FEWEST_CLUSTERS:
@@ -155,6 +149,11 @@ def _describe_rows(results: Results) -> Iterator[str]:
     if not math.isclose(horizon_s, asked_s):
         yield f"Too few are in range for {asked_s:g} s: means are up to {horizon_s:.3g} s."
     yield ""
+
+
+def describe_counted(objects: int, passes: int) -> str:
+    """`5 objects`; `5 objects in 9 passes`."""
+    return count_noun(objects, "object") + (f" in {count_noun(passes, 'pass', 'passes')}" if passes > objects else "")
 
 
 def _describe_left_out(results: Results) -> str:
@@ -176,7 +175,7 @@ def _describe_left_out(results: Results) -> str:
 _WIDE = 80
 SHOWN = {
     "ttd_rmst_s": "known", SHARE: "brakes for nothing", "pass_share": "brakes in time",
-    "position_rmse_held_m": "position error, m", "false_positives_per_min": "false per minute",
+    "position_rmse_held_m": "position error, m", FALSE: "false per minute",
 }  # fmt: skip
 """Metrics of a comparison that are shown, the first ones first, and their headers."""
 
@@ -192,12 +191,16 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
     """The lines of a comparison but for the answer, and those of its rows that have one of the `best`."""
     overall = comparison.overall
     rows = {(row.configuration, row.metric): row for row in overall.itertuples(index=False)}
-    least = {SHARE: MATTERS_SHARE}
+    least, most = {SHARE: MATTERS[SHARE]}, _MOST_CHANGES if comparison.newer else _MOST_ROWS
     same = [name for name in comparison.unchanged if name not in comparison.truths]
-    folded = [f"{_join_names(same, _WIDE)}: unchanged"] if same else []
+    folded = [f"{name_first(same, _WIDE, _WIDE - len(': unchanged'))}: unchanged"] if same else []
     told = comparison.changed.configurations
     if not (names := [name for name in told if name not in comparison.truths] or told):
         return folded, []
+    if comparison.newer:  # whoever changed most comes first, so that it fits however many did
+        matters = overall["metric"].map(MATTERS).astype(float)
+        changes = (overall["difference"].abs() / matters).groupby(overall["configuration"]).max().fillna(0.0)
+        names = sorted(names, key=lambda name: (name not in best, -changes[name]))
     overall = overall[overall["configuration"].isin(names)]
     cells = {
         metric: [tell_difference(metric, rows.get((name, metric)), alike=bool(comparison.newer)) for name in names]
@@ -205,8 +208,17 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
         if overall.loc[overall["metric"] == metric, "difference"].abs().gt(least.get(metric, NOTHING)).any()
     }
     packed = _pack_columns(names, cells)
-    tables = [_tabulate_differences(names, {metric: cells[metric] for metric in of}, best) for of in packed]
-    shown = tables[: max(1, _MOST_ROWS // len(tables[0][0]))] if tables else []
+    tables = [
+        tabulate_alike(
+            zip(names, zip(*(cells[metric] for metric in of), strict=True), strict=True),
+            [SHOWN[metric] for metric in of], best, pad=str.ljust, most=most,
+        )
+        for of in packed
+    ]  # fmt: skip
+    number = max(1, most // len(tables[0][0])) if tables else 0
+    shown, cells = tables[:number], {metric: cells[metric] for of in packed[:number] for metric in of}
+    if left := [SHOWN[metric].partition(", ")[0] for of in packed[number:] for metric in of]:
+        folded.insert(0, f"{' and '.join(left)}: --explain")
     lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
     lines += folded
     starred = any(f" {STAR}" in line for line in lines)
@@ -229,22 +241,6 @@ def _pack_columns(names: Sequence[str], cells: Mapping[str, Sequence[str]]) -> l
     return packed
 
 
-def _tabulate_differences(
-    names: Sequence[str], cells: Mapping[str, Sequence[str]], best: Sequence[str]
-) -> tuple[list[str], list[str]]:
-    """The lines of one table, a row for all that differ alike, and those that have one of the `best`."""
-    grouped: dict[tuple[str, ...], list[str]] = {}
-    for k, name in enumerate(names):
-        grouped.setdefault(tuple(of_metric[k] for of_metric in cells.values()), []).append(name)
-    shown = list(grouped)[:_MOST_ROWS]
-    table = [("", *(SHOWN[metric] for metric in cells)), *((_join_names(grouped[of]), *of) for of in shown)]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in table]
-    marked = [line for line, of in zip(lines[1:], shown, strict=True) if {*grouped[of]} & {*best}]
-    left = sum(len(grouped[of]) for of in list(grouped)[_MOST_ROWS:])
-    return [*lines, *([f"and {left} more: --explain"] if left else [])], marked
-
-
 def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: bool) -> Iterator[str]:
     """What it is held against, and what the intervals are over."""
     limited, over = comparison.overall.dropna(subset=["interval_over", "clusters"]), dict[str, list[str]]()
@@ -256,7 +252,7 @@ def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: boo
             )
     why = "" if comparison.baseline_why is None else f" ({comparison.baseline_why})"
     against = f"against {comparison.baseline}{why}; --baseline names another"
-    itself = f"each minus itself in {comparison.baseline}; --explain: every figure; --baseline: all against one"
+    itself = f"each minus itself in {comparison.baseline}; every figure: --explain"
     yield itself if comparison.newer else against
     for k, (words, headers) in enumerate(over.items()):
         of_what = f" of {' and '.join(headers)}" if len(over) > 1 else ""
@@ -274,7 +270,7 @@ def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
     size, limits = float(row.difference), (row.low, row.high)
     known = not (pd.isna(row.low) or pd.isna(row.high))
     if metric == "ttd_rmst_s":
-        if abs(size) < MATTERS_S and (not known or max(abs(row.low), abs(row.high)) < MATTERS_S):
+        if max(map(abs, (size, *limits) if known else (size,))) < MATTERS[metric]:
             return "as soon"
         told, known = tell_seconds(size, row.low, row.high), False
     else:

@@ -11,22 +11,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pandas as pd
 
+from copem_replay.core.errors import name_first
 from copem_replay.metrics.braking.driving import SHARE
 from copem_replay.metrics.summary_metrics import COMPARED
 from copem_replay.results.compare.limits import BETTER, STAR, WORSE
 from copem_replay.results.compare.tables import explain_no_interval
-from copem_replay.results.decision import MATTERS_S, MATTERS_SHARE
+from copem_replay.results.decision import MATTERS
 from copem_replay.results.screen import tell_difference
 
 if TYPE_CHECKING:
     from copem_replay.results.compare import Comparison
 
 _DECIDED_BY = {
-    "pass_share": ("brakes in time {}", MATTERS_SHARE), "ttd_rmst_s": ("{}", MATTERS_S),
-    SHARE: ("brakes for nothing {}", MATTERS_SHARE), "position_rmse_held_m": ("position error {} m", 0.05),
-    "false_positives_per_min": ("false per minute {}", 0.1),
+    "pass_share": "brakes in time {}", "ttd_rmst_s": "{}", SHARE: "brakes for nothing {}",
+    "position_rmse_held_m": "position error {} m", "false_positives_per_min": "false per minute {}",
 }  # fmt: skip
-"""Figures that decide, the first ones first: their words, and the least difference of each that matters."""
+"""Figures that decide, the first ones first, and their words."""
+_NAMED = 3
 _ALONE = "without an interval, on these objects alone"
 
 
@@ -45,18 +46,18 @@ def tell_change(comparison: Comparison) -> VersionChange:
     told = [name for name in known if name not in comparison.unchanged]
     groups: dict[str, dict[str, list[str]]] = {word: {} for word in (WORSE, BETTER, _ALONE)}
     for name in told:
-        for metric, (words, least) in _DECIDED_BY.items():
+        for metric, words in _DECIDED_BY.items():
             row = rows.get((name, metric))
-            if (word := _judge_row(row, comparison.matters.get(metric, least))) is not None:
+            if (word := _judge_row(row, comparison.matters.get(metric, MATTERS[metric]))) is not None:
                 size, *more = tell_difference(metric, row, alike=True).removesuffix(f" {STAR}").split(" ", 1)
                 groups[word].setdefault(name, []).append(" ".join([words.format(size), *more]))
     differing = tuple(dict.fromkeys(name for of in groups.values() for name in of))
-    said = [f"{word}: {_list_names(_join_figures(of), 2)}" for word, of in groups.items() if of]
+    said = [f"{word}: {name_first(_join_figures(of), 2)}" for word, of in groups.items() if of]
     if quiet := [name for name in told if name not in differing]:
-        said.append(f"no difference is shown: {_list_names(quiet)}")
+        said.append(f"no difference is shown: {name_first(quiet, _NAMED)}")
     short = " and ".join(word for word in (BETTER, WORSE) if groups[word])
     short = short or ("no interval" if groups[_ALONE] else "no difference is shown" if told else "nothing changed")
-    same = f"{len(known) - len(told)} unchanged" if told else f"nothing changed: {_list_names(known)}"
+    same = f"{len(known) - len(told)} unchanged" if told else f"nothing changed: {name_first(known, _NAMED)}"
     said += [same] if len(known) > len(told) else []
     head = f"{', '.join(comparison.newer)} against {comparison.baseline}: "
     return VersionChange(head + short, head + "; ".join(said), differing)
@@ -75,7 +76,3 @@ def _join_figures(figures: Mapping[str, Sequence[str]]) -> list[str]:
     """Each configuration with its first figure, and how many others it has."""
     more = {name: f" (+{len(of) - 1} figure{'s' * (len(of) > 2)})" if of[1:] else "" for name, of in figures.items()}
     return [f"{name} {of[0]}{more[name]}" for name, of in figures.items()]
-
-
-def _list_names(names: Sequence[str], most: int = 3) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from copem_replay.core.errors import (
     EgoError,
     EmptyWindowError,
     RecordingError,
+    name_first,
     near_name_hint,
     unknown_name_message,
 )
@@ -87,3 +89,22 @@ def test_workers_hand_errors_on_whole() -> None:
 )
 def test_a_name_that_is_alike(name: str, known: list[str], hint: str) -> None:
     assert near_name_hint(name, known) == hint
+
+
+@pytest.mark.parametrize(
+    ("most", "room", "said"),
+    [
+        (3, math.inf, "gnn, union, late and 2 more"),
+        (5, math.inf, "gnn, union, late, alone, nms"),
+        (9, 28, "gnn, union, late, alone, nms"),
+        (9, 27, "gnn, union, late and 2 more"),
+        (9, 26, "gnn, union and 3 more"),
+        (9, 3, "gnn and 4 more"),
+    ],
+)
+def test_of_many_names_the_first_are_listed(most: int, room: float, said: str) -> None:
+    assert name_first(["gnn", "union", "late", "alone", "nms"], most, room) == said
+
+
+def test_of_no_names_nothing_is_listed() -> None:
+    assert name_first([], 3) == ""

@@ -59,7 +59,7 @@ def test_the_screen_has_the_seconds_of_the_tables(call) -> None:  # type: ignore
     assert len(said) <= 24
     assert max(map(len, said)) <= 120
     head, *rows = [re.split(r" {2,}", line.strip()) for line in said[: said.index("") - 1]]
-    assert said[len(rows) + 1].startswith("Seconds to the end of each episode")
+    assert said[len(rows) + 1].startswith("Mean seconds that an object is unknown, to its end")
     shown = {"missed in sight": "missed", "latency": "latency", "hidden": "hidden", "out of view": "range"}
     assert head[0] == "unknown"
     assert {shown[word] for word in head[1:]} == set(causes.columns[(causes.abs() >= 0.005).any()])

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -13,7 +14,7 @@ import pytest
 import yaml
 
 import copem_replay as cr
-from copem_replay.results.compare import Comparison
+from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.decision import Decision, decide, decide_compared, describe_verdicts
 from copem_replay.results.table_files import LogRows
 from copem_replay.results.verdicts import MET, NOT_MET, UNDECIDED, Judgement, Verdict
@@ -47,6 +48,11 @@ def cooperating(**latencies_s: float) -> cr.Experiment:
     return cr.Experiment.model_validate(plain)
 
 
+def study(**latencies_s: float) -> Any:
+    """Results of that experiment, in which nobody is asked to brake."""
+    return SimpleNamespace(experiment=cooperating(**latencies_s), summary=pd.DataFrame())
+
+
 class TestLatencies:
     def test_up_to_which_latency_cooperation_helps(self) -> None:
         found = decide_compared(
@@ -56,7 +62,7 @@ class TestLatencies:
                 ("co1", 0.64, 0.844, -0.25, -0.15),
                 ("co05", 0.96, 0.844, 0.05, 0.15),
             ),
-            cooperating(co0=0.0, co05=0.5, co1=1.0),
+            study(co0=0.0, co05=0.5, co1=1.0),
         )
         assert found.sentence == (
             "Up to 0.5 s of latency cooperation helps: 96 % of conflicts pass against 84 % with PEM alone, by 11.6 "
@@ -68,7 +74,7 @@ class TestLatencies:
     def test_with_one_in_between_that_cannot_be_told(self) -> None:
         found = decide_compared(
             compared("ttd_rmst_s", ("co0", 0.0, 0.7, -0.8, -0.6), ("co1", 0.9, 0.7, -0.1, 0.5)),
-            cooperating(co0=0.0, co1=1.0),
+            study(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
             "Without latency cooperation helps: an object is known after 0.00 s on average against 0.70 s with PEM "
@@ -79,7 +85,7 @@ class TestLatencies:
     def test_out_of_their_order_each_is_named(self) -> None:
         found = decide_compared(
             compared("ttd_rmst_s", ("co0", 0.9, 0.7, 0.1, 0.3), ("co1", 0.1, 0.7, -0.7, -0.5)),
-            cooperating(co0=0.0, co1=1.0),
+            study(co0=0.0, co1=1.0),
         )
         assert found.sentence == (
             "Sooner than PEM (known after 0.70 s on average): co1 by 0.60 s [0.50, 0.70]; later than PEM: "
@@ -193,6 +199,35 @@ class TestBrakingForNothing:
         assert found.sentence.endswith("(a: never).")
 
     @pytest.mark.parametrize(
+        ("shares", "said"),
+        [
+            pytest.param(
+                (0.25, 0.0, 0.2, 0.3),
+                "But with a the driver brakes for nothing in 25 % of these 360 s of driving (PEM: never), losing up to "
+                "0.5 m/s at a time mostly because of old entries.",
+                id="of who is named, whatever others brake for",
+            ),
+            pytest.param(
+                (0.25, 0.25, 0.0, 0.0),
+                "The driver brakes for nothing mostly because of misplaced true objects.",
+                id="all alike",
+            ),
+        ],
+    )
+    def test_what_they_brake_for_is_said(self, shares: tuple[float, ...], said: str) -> None:
+        times, share = compared("ttd_rmst_s", *self.SOONER), compared("needless_brake_share", ("a", *shares))
+        both = replace(times, table=pd.concat([times.table, share.table], ignore_index=True))
+        names, of_base = ["a", "PEM"], shares[1]
+        summary = pd.DataFrame({"configuration": names, "needless_brake_share": [0.25, of_base], "driving_h": 0.1})
+        rows = [("a", "late", 3.0), ("a", "misplaced", 2.0), ("PEM", "misplaced", 9.0), ("PEM", "ghost", 1.0)]
+        needless = pd.DataFrame(rows, columns=["configuration", "cause", "lasts_s"])
+        results: Any = SimpleNamespace(
+            summary=summary.assign(needless_speed_lost_max_mps=0.5), experiment=None,
+            has=lambda name: name == "needless.parquet", frame=lambda _: needless,
+        )  # fmt: skip
+        assert decide_compared(both, results).sentences[-1] == said
+
+    @pytest.mark.parametrize(
         "share",
         [
             pytest.param(("a", 0.004, 0.0, 0.003, 0.005), id="a half per cent is the least that is said"),
@@ -267,6 +302,35 @@ class TestParts:
     def test_of_the_car_alone_there_are_no_parts(self, tmp_path: Path) -> None:
         [told] = approached(tmp_path, car="[ego]", better="[ego, more]")
         assert told.startswith("Sooner than car (known after 2.70 s on average): better by 2.70 s [")
+
+    def test_of_one_unit_fusion_and_latency_are_told(self, tmp_path: Path) -> None:
+        assert approached(
+            tmp_path,
+            ideal="[mast]",
+            gnn="[mast], fusion: {kind: gnn}",
+            late="[mast], fusion: {kind: gnn}, latency_s: 1",
+        ) == (
+            "Fusion: the same as ideal (known after 0.00 s on average): gnn.",
+            "Latency: 1 s costs 1.00 s, alike in every pair (late against gnn).",
+        )
+
+    def test_each_pair_is_compared_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        pairs: list[tuple[str, str]] = []
+
+        def counted(*given: Any, **options: Any) -> Comparison:
+            found = compare_folders(*given, **options)
+            pairs.extend((name, found.baseline) for name in found.configurations)
+            return found
+
+        monkeypatch.setattr("copem_replay.results.decision.compare_folders", counted)
+        gnn = "[ego, mast], fusion: {kind: gnn}"
+        told = approached(
+            tmp_path, ideal="[ego, mast]", gnn=gnn, alone="[ego], fusion: {kind: gnn}", late=f"{gnn}, latency_s: 0.5",
+            better="[ego, more]",
+        )  # fmt: skip
+        assert [part.partition(":")[0] for part in told] == ["Cooperation", "Fusion", "Latency", "Beside them"]
+        assert sorted(pairs) == sorted({*pairs})
+        assert {("gnn", "ideal"), ("gnn", "alone"), ("late", "gnn"), ("better", "alone")} <= {*pairs}
 
     def test_latencies_between_which_the_help_ends_are_the_sentence(self, tmp_path: Path) -> None:
         [told] = approached(tmp_path, car="[ego]", at_once="[ego, mast]", late="[ego, mast], latency_s: 2.9")

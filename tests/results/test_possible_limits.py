@@ -113,7 +113,7 @@ def test_of_real_recordings(tmp_path: Path, name: str) -> None:
     if not (SHARED / f"{name}.mcap").exists():
         pytest.skip("no shared/data beside the project")
     draft = format_draft(survey_recording(SHARED / f"{name}.mcap"))
-    (tmp_path / "e.yaml").write_text(draft.replace("runs: 20", "runs: 3").replace("show: {run: 0}", "show: null"))
+    (tmp_path / "e.yaml").write_text(draft.replace("runs: 20", "runs: 6").replace("show: {run: 0}", "show: null"))
     results = cr.run(tmp_path / "e.yaml")
     check_table(results.summary, {of: facts.least_s for of, facts in results.facts.items()})
     assert sum(check_comparison(results, baseline) for baseline in ("GT", "ideal", "late")) > 0

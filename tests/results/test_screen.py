@@ -9,9 +9,12 @@ from typing import Any
 import pytest
 
 import copem_replay as cr
+from copem_replay.core.errors import wrap_line
+from copem_replay.results.compare import comparison_text
 from copem_replay.results.decision import decide
 from copem_replay.results.read import Results
 from copem_replay.results.screen import choose_notes, format_comparison, format_screen
+from copem_replay.results.versions import tell_change
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 
 PEM = {"p": [{"detection": {"kind": "constant", "probability": 0.6}}]}
@@ -106,8 +109,59 @@ def test_eighteen_configurations_fit(tmp_path: Path) -> None:
         f"late {k}": {"units": ["ego"], "latency_s": 0.1 * k, "fusion": {"kind": "gnn"}} for k in range(18)
     }
     lines = screen(replay(tmp_path, 5, configurations=many))
-    assert "and 6 more in summary.csv" in lines
+    assert "and 6 more: summary.csv" in lines
     assert len(lines) <= 24
+
+
+def test_who_lists_nobody_is_said_in_a_line(tmp_path: Path) -> None:
+    """Ghosts in half of the lists of the ego, a list every 0.1 s."""
+    haunted = {"p": {"couples": PEM["p"], "ghosts": [{"in_list": 0.5, "where": {"kind": "field", "range_m": [5, 40]}}]}}
+    results = replay(tmp_path, 5, pems=haunted)
+    rate = results.summary.set_index("configuration")["false_positives_per_min"]
+    assert rate["alone"] > 100 > rate["ideal"] == 0
+    (line,) = (line for line in screen(results) if line.startswith("False per minute: "))
+    assert len(line) <= 80
+    worst = rate.idxmax()
+    assert line.startswith(f"False per minute: {worst} {rate[worst]:.0f}")
+    lasts_s = results.frame("false_tracks.parquet")["lasts_s"].max()
+    assert line.endswith(f"; none lasts over {lasts_s:.2g} s.")
+    assert not any("ideal" in name for name in line.split(", "))
+    (tmp_path / "sure").mkdir()
+    assert not [line for line in screen(replay(tmp_path / "sure", 2)) if line.startswith("False")]
+
+
+def test_what_the_intervals_of_driving_are_over(tmp_path: Path) -> None:
+    """Of one drive they are over its runs, whatever objects there are."""
+    braking = {"driver": {"kind": "constant_deceleration", "a_max_mps2": 8.0}}
+    compared = cr.compare(replay(tmp_path, 5, braking=braking))
+    rows = compared.table["metric"] == "needless_brake_share"
+    table = compared.table.copy()
+    table.loc[rows, ["low", "high", "clusters"]] = [0.1, 0.2, 5]
+    table.loc[rows, "interval_over"] = "runs"
+    said = comparison_text(with_fields(compared, table=table))
+    over = " ".join(said.split()).partition("[95 %]: over ")[2]
+    assert over.startswith("5 objects of this drive: ")
+    assert "5 runs of the driving: how far other draws" in over
+    assert "of this one object" not in over
+
+
+def test_newer_results_fit_though_all_changed(tmp_path: Path) -> None:
+    """Eleven configurations, each later by another time: the five that changed most, and how many others did."""
+    late = {f"late {k}": {"units": ["ego"], "latency_s": 0.1 * k, "fusion": {"kind": "gnn"}} for k in range(11)}
+    for name, probability in (("old", 0.9), ("new", 0.2)):
+        (tmp_path / name).mkdir()
+        sure = {"p": [{"detection": {"kind": "constant", "probability": probability}}]}
+        replay(tmp_path / name, 6, configurations=late, pems=sure).save(tmp_path / name / name)
+    compared = cr.compare([tmp_path / "old/old", tmp_path / "new/new"])
+    change = tell_change(compared)
+    lines, _ = format_comparison(compared, change.differing)
+    shown = [line for line in lines if line.startswith("late")]
+    assert len(shown) == 5
+    assert "and 6 more: --explain" in lines
+    both = compared.overall[compared.overall["metric"] == "ttd_rmst_s"].set_index("configuration")["difference"]
+    assert shown[0].startswith(both.abs().idxmax()) or shown[0].split("  ")[0] in change.differing
+    wrapped = [part for line in [change.head, *lines, "", change.sentence] for part in wrap_line(line, 80)]
+    assert len(wrapped) <= 21, "with three lines of notes"
 
 
 def test_a_comparison_says_sooner_and_later(tmp_path: Path) -> None:

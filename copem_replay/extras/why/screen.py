@@ -6,16 +6,16 @@ from collections.abc import Iterator
 
 import pandas as pd
 
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import count_noun, name_first
 from copem_replay.extras.why.api import VISIBLE_S, Explanation
 from copem_replay.extras.why.causes import describe_cause
 from copem_replay.extras.why.sensitivity import AS_IT_IS, describe_orders
 from copem_replay.extras.why.triage import LATE_S, describe_structure
+from copem_replay.results.screen import tabulate_alike
 
-_MOST_ROWS = 12
-"""Configurations in the table; more are in `why.csv`."""
 _MOST_SPARED = 3
 """Lines on what units spare; all are in `units.csv`."""
+_NAMED = 3
 _HEADERS = {"range": "out of view", "hidden": "hidden", "missed": "missed in sight"}
 """Causes whose words are too long for a header; of others the part before a colon."""
 
@@ -38,25 +38,13 @@ def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
     added = added.reindex(index=causes["configuration"].unique(), columns=causes["cause"].unique()).fillna(0.0)
     unknown_s = added.sum(axis=1)
     shown = added.loc[unknown_s.sort_values(kind="stable").index, (added.abs() >= VISIBLE_S).any()]
-    rows: dict[tuple[str, ...], list[str]] = {}
-    for name, of in shown.iterrows():
-        cells = [f"{value:.2f}" if abs(value) >= VISIBLE_S else "–" for value in of]
-        rows.setdefault((f"{unknown_s[name] + 0.0:.2f}", *cells), []).append(str(name))
+    seconds = (
+        (str(name), [f"{unknown_s[name] + 0.0:.2f}", *(f"{s:.2f}" if abs(s) >= VISIBLE_S else "–" for s in of)])
+        for name, of in shown.iterrows()
+    )
     heads = [_HEADERS.get(str(cause), describe_cause(str(cause)).partition(":")[0]) for cause in shown]
-    kept = [*rows.items()][:_MOST_ROWS]
-    table = [["", "unknown", *heads], *([_join_names(names), *cells] for cells, names in kept)]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))])
-        for row in table
-    ]
-    left = sum(len(names) for names in [*rows.values()][_MOST_ROWS:])
-    more = [f"and {left} more in why.csv"] if left else []
-    return [*(line.rstrip() for line in lines), *more, "Seconds to the end of each episode, beyond the limit of `run`."]
-
-
-def _join_names(names: list[str]) -> str:
-    return ", ".join(names) if len(names) <= 3 else f"{names[0]} and {len(names) - 1} more"
+    lines, _ = tabulate_alike(seconds, ["unknown", *heads], more_in="why.csv")
+    return [*lines, "Mean seconds that an object is unknown, to its end: `run` counts up to a limit."]
 
 
 def _tell_units(units: pd.DataFrame) -> list[str]:
@@ -66,11 +54,12 @@ def _tell_units(units: pd.DataFrame) -> list[str]:
     for unit in most.index:
         by_words: dict[str, list[str]] = {}
         for row in units[units["unit"] == unit].itertuples(index=False):
-            by_words.setdefault(f"{row.share_s + 0.0:.2f} s", []).append(str(row.configuration))
-        told = ", ".join(f"{words} in {_join_names(of)}" for words, of in by_words.items())
+            saved = f"{row.share_s:.2f} s" if abs(row.share_s) >= VISIBLE_S else "nothing"
+            by_words.setdefault(saved, []).append(str(row.configuration))
+        told = ", ".join(f"{words} in {name_first(of, _NAMED)}" for words, of in by_words.items())
         alike.setdefault(told, []).append(str(unit))
-    shown = [f"{_join_names(of)} save{'s' * (len(of) == 1)} {told}." for told, of in [*alike.items()][:_MOST_SPARED]]
-    return [*shown, *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
+    shown = [f"{name_first(of, _NAMED)} save{'s' * (len(of) == 1)} {told}." for told, of in alike.items()]
+    return [*shown[:_MOST_SPARED], *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
 
 
 def _tell_late(groups: pd.DataFrame, folder: str, *, of_one: bool) -> list[str]:
@@ -97,5 +86,5 @@ def _tell_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
         means_s = varied.groupby("variation")["unknown_s"].mean()
         return [f"As the PEMs vary it is unknown for {means_s.min():.2f} to {means_s.max():.2f} s."]
     if not orders["beyond"].any():
-        return [f"The order of configurations stays with {', '.join(variations)}."]
+        return [f"Their order stays as PEMs vary: detection {', '.join(variations)}."]
     return describe_orders(varied, orders)

@@ -1,7 +1,7 @@
 """Triage: late episodes of a configuration in groups that have one story, ranked by the seconds that they cost.
 
 An episode is late where its object is unknown for more than a second. Its cause is the one that adds most in the chain
-(`causes.py`); a group is a drive, a cause, and what hides the object, or else on which side of the ego it is.
+(`causes.py`); a group is a drive and a cause, whatever hides its objects, or on whichever side of the ego they are.
 An episode is late by structure where it stays late although nothing in sight is missed, else by chance. Definitions:
 docs/guide/why.md.
 """
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from copem_replay.core.errors import name_first
 from copem_replay.core.tracks import SAME_INSTANT_S, Float, Int
 from copem_replay.extras.why.causes import CAUSES, LEFT, CauseShares, Counterfactuals, name_cause
 from copem_replay.perception.sight import HIDDEN
@@ -26,6 +27,7 @@ _MOST_LATE = 0.05
 _HELPED = ("hidden", "rate", "outages", "range", "missed", "memory", "fusion", "pose", "ghosts")
 """Causes of sensors and of the fusion: what stays unknown without these nobody can know in time."""
 EPISODE = ["log", "object_id", "episode"]
+_NAMED = 3
 
 
 def tabulate_episodes(replays: Counterfactuals, shares: Sequence[CauseShares], late_s: float = LATE_S) -> pd.DataFrame:
@@ -66,15 +68,22 @@ def group_late_episodes(
     if is_late.any():
         episodes.loc[is_late, ["where", "hidden_by"]] = find_places(replays.replay, episodes[is_late])
     grouped = []
-    for (log, cause, where), of in episodes[is_late].groupby(["log", "cause", "where"], sort=False):
+    for (log, cause), of in episodes[is_late].groupby(["log", "cause"], sort=False):
         worst = of.loc[of["unknown_s"].idxmax()]
         grouped.append({
-            "log": log, "cause": cause, "where": where, "episodes": len(of), "objects": of["object_id"].nunique(),
-            "lost_s": of["unknown_s"].sum(), "never_share": of["never_share"].mean(),
-            "structural_share": _share_structural(of["structural_share"]), "example": worst["object_id"],
-            "example_class": worst["object_class"], "example_onset_s": worst["onset_s"],
+            "log": log, "cause": cause, "where": name_places(of), "episodes": len(of),
+            "objects": of["object_id"].nunique(), "lost_s": of["unknown_s"].sum(),
+            "never_share": of["never_share"].mean(), "structural_share": _share_structural(of["structural_share"]),
+            "example": worst["object_id"], "example_class": worst["object_class"], "example_onset_s": worst["onset_s"],
         })  # fmt: skip
     return rank_groups(pd.DataFrame(grouped, columns=COLUMNS)), episodes
+
+
+def name_places(late: pd.DataFrame) -> str:
+    """`bus 12 for 3.1 s, car 5 for 1.2 s`: where a group loses its seconds, the most first; one place alone."""
+    lost_s = late[late["where"] != ""].groupby("where")["unknown_s"].sum().sort_values(ascending=False, kind="stable")
+    told = {str(where): f"{where} for {seconds:.1f} s" for where, seconds in lost_s.items()}
+    return name_first([*(told.values() if len(told) > 1 else told)], _NAMED)
 
 
 def _share_structural(of_episodes: pd.Series) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import count_noun, name_first
 from copem_replay.metrics.limits import NOT_ENOUGH, NOTHING_DRAWN
 from copem_replay.report.figures.style import (
     describe_over,
@@ -22,9 +22,8 @@ from copem_replay.report.figures.style import (
     write_limits,
 )
 from copem_replay.report.html.markup import Html, escape_text, fold_parts, join_html, make_list, make_tag
-from copem_replay.report.html.setup import join_names, shorten_list
+from copem_replay.report.html.setup import NAMED, join_names
 from copem_replay.report.html.study import ReportData
-from copem_replay.results.compare import Comparison
 from copem_replay.results.compare.tables import NOTHING, describe_gain
 from copem_replay.results.decision import decide
 
@@ -41,15 +40,10 @@ def write_details(study: ReportData) -> Html:
     """What else stands out, what varies most; caveats below, folded."""
     if not len(study.results.known):
         return make_list(str(note) for note in study.provenance.get("notes", []))
-    caveats = [*_caveat_sentences(study)]
-    return join_html(
-        [
-            make_list(map(_prevent_breaks, _detail_sentences(study))),
-            fold_parts(
-                f"How sure this is: {count_noun(len(caveats), 'remark')}", make_list(map(_prevent_breaks, caveats))
-            ),
-        ]
-    )
+    found, caveats = _detail_sentences(study), [*_caveat_sentences(study)]
+    folded = make_list(map(_prevent_breaks, caveats))
+    sure = fold_parts(f"How sure this is: {count_noun(len(caveats), 'remark')}", folded)
+    return join_html([make_list(map(_prevent_breaks, found)), sure])
 
 
 def _prevent_breaks(sentence: str) -> Html:
@@ -84,20 +78,15 @@ def _elsewhere_sentences(study: ReportData) -> Iterator[str]:
         )
 
 
-def _format_difference(row: Any, unit: str = " s") -> str:
-    shown = format_signed_decimals(row.difference) + unit
-    if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
-        return shown
-    logs = "" if pd.isna(row.logs_better) else f", {describe_gain(row)}"
-    return f"{shown} {write_limits(row.low, row.high)}{logs}"
-
-
-def _format_unsure(row: Any) -> str:
-    if pd.isna(row.interval_over) or pd.isna(row.low) or pd.isna(row.high):
-        return ", without an interval"
-    if row.low <= NOTHING and row.high >= -NOTHING:
-        return ": the interval includes 0, so no difference can be shown"
-    return ""
+def _format_points(row: Any) -> str:
+    """A difference of shares with its interval, in percentage points, and whether it can be shown."""
+    shown = f"{format_signed_decimals(100 * row['difference'])} percentage points"
+    if row[["interval_over", "low", "high"]].isna().any():
+        return f"{shown}, without an interval"
+    logs = "" if pd.isna(row["logs_better"]) else f", {describe_gain(row)}"
+    low, high = 100 * row["low"], 100 * row["high"]
+    unsure, shown = low <= NOTHING and high >= -NOTHING, f"{shown} {write_limits(low, high)}{logs}"
+    return shown + ": the interval includes 0, so no difference can be shown" * bool(unsure)
 
 
 def _detected_sentences(study: ReportData, share: pd.Series) -> Iterator[str]:
@@ -136,17 +125,14 @@ def _pass_sentences(study: ReportData) -> Iterator[str]:
     best, worst = str(share.idxmax()), str(share.idxmin())
     alike, last = ([str(name) for name in share.index[share == share[one]]] for one in (best, worst))
     sentence = f"Braking in time: of {count_noun(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
-    sentence += f"{_format_share(judged.loc[best])} pass with {shorten_list(alike)}"
+    sentence += f"{_format_share(judged.loc[best])} pass with {name_first(alike, NAMED)}"
     if len(alike) < len(share):
-        sentence += f", {_format_share(judged.loc[worst])} with {shorten_list(last)}"
+        sentence += f", {_format_share(judged.loc[worst])} with {name_first(last, NAMED)}"
     if study.regret is not None and study.baseline not in alike:
-        differences = _metric_rows(study.regret, "pass_share").set_index("configuration")
+        overall = study.regret.overall
+        differences = overall[overall["metric"] == "pass_share"].set_index("configuration")
         if best in differences.index and pd.notna(differences.loc[best, "difference"]):
-            row = differences.loc[best]
-            points = row.copy()
-            points[["difference", "low", "high"]] = 100 * row[["difference", "low", "high"]].astype(float)
-            difference = _format_difference(points, " percentage points")
-            sentence += f"; {best} against {study.baseline} {difference}{_format_unsure(points)}"
+            sentence += f"; {best} against {study.baseline} {_format_points(differences.loc[best])}"
     yield sentence + "."
 
 
@@ -204,12 +190,7 @@ def _certainty_sentences(study: ReportData) -> Iterator[str]:
 def _left_out_sentences(study: ReportData) -> Iterator[str]:
     skipped = [str(log["log"]) for log in study.provenance.get("logs_skipped", [])]
     if skipped:
-        yield f"In no figure, because the replay failed: {shorten_list(skipped)}."
+        yield f"In no figure, because the replay failed: {name_first(skipped, NAMED)}."
     notes = study.provenance.get("notes", [])
     if notes:
         yield f"{count_noun(len(notes), 'note')} on recordings and experiment: see Where this comes from."
-
-
-def _metric_rows(comparison: Comparison, metric: str) -> pd.DataFrame:
-    overall = comparison.overall
-    return overall[overall["metric"] == metric]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from copem_replay.core.components import Component
-from copem_replay.core.errors import count_noun
+from copem_replay.core.errors import count_noun, name_first
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.window import describe_window
@@ -170,19 +170,13 @@ def _describe_pem(pem: Pem) -> list[str]:
 # Question and configurations.
 
 _CLASSES = {"vru": "vulnerable road user", "vehicles": "vehicle"}
-_NAMED = 6
+NAMED = 6
 """Most units, logs or objects that are named one by one: more make a sentence hard to read."""
-
-
-def shorten_list(names: Sequence[str]) -> str:
-    """Names with commas; of too many the first, and how many more there are."""
-    shown = ", ".join(names[:_NAMED])
-    return shown if len(names) <= _NAMED else f"{shown} and {len(names) - _NAMED} more"
 
 
 def join_names(names: Sequence[str]) -> str:
     """`A, B and C`; of too many the first, and how many more there are."""
-    return f"{shorten_list(names[:-1])} and {names[-1]}" if 1 < len(names) <= _NAMED else shorten_list(names)
+    return f"{', '.join(names[:-1])} and {names[-1]}" if 1 < len(names) <= NAMED else name_first(names, NAMED)
 
 
 def describe_recordings(study: ReportData) -> str:
@@ -192,7 +186,7 @@ def describe_recordings(study: ReportData) -> str:
     part = ""
     if window is not None and window != (None, None):
         part = f" ({describe_window(*window)} of {'it' if len(names) == 1 else 'each'})"
-    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({shorten_list(names)})") + part
+    return (f"the log {names[0]}" if len(names) == 1 else f"{len(names)} logs ({name_first(names, NAMED)})") + part
 
 
 def describe_question(study: ReportData) -> str:
@@ -280,9 +274,9 @@ def _describe_units(configuration: Configuration, units: Sequence[str]) -> str:
     if configuration.units == "truth":
         return "ground truth"
     if configuration.recorded is not None:
-        inputs = f", of {shorten_list(configuration.inputs)}" if configuration.inputs else ""
+        inputs = f", of {name_first(configuration.inputs, NAMED)}" if configuration.inputs else ""
         return f"recorded on {configuration.recorded.topic}{inputs}"
-    return f"{len(units)}: {shorten_list(units)}" if len(units) > 1 else "".join(units)
+    return f"{len(units)}: {name_first(units, NAMED)}" if len(units) > 1 else "".join(units)
 
 
 def _describe_fusion(configuration: Configuration) -> str:
@@ -313,7 +307,8 @@ def _describe_links(experiment: Experiment, configuration: Configuration, units:
             by.setdefault(f"link {link} = {_describe_component(experiment.links[link])}", []).append(unit)
         elif link is not None:
             by.setdefault(_describe_component(link), []).append(unit)
-    links = [link if len(names) == len(senders) else f"{shorten_list(names)} by {link}" for link, names in by.items()]
+    all_of = len(senders)
+    links = [link if len(of) == all_of else f"{name_first(of, NAMED)} by {link}" for link, of in by.items()]
     late = [_describe_latency(configuration, units)] if configuration.latency_s or not links else []
     issued = [f"issued at {configuration.issue_hz:g} Hz"] if configuration.issue_hz is not None else []
     return "; ".join([*links, *late, *issued])
@@ -325,4 +320,4 @@ def _describe_latency(configuration: Configuration, units: Sequence[str]) -> str
     by: dict[float, list[str]] = {}
     for unit in units:
         by.setdefault(configuration.latency_of(unit), []).append(unit)
-    return "; ".join(f"{shorten_list(names)} {latency_s:g} s" for latency_s, names in by.items())
+    return "; ".join(f"{name_first(names, NAMED)} {latency_s:g} s" for latency_s, names in by.items())

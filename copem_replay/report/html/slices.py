@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from copem_replay.core.errors import count_noun
+from copem_replay.metrics.limits import count_clusters
 from copem_replay.metrics.slices import describe_chance
-from copem_replay.metrics.summary import EPISODE
 from copem_replay.report.figures.slices import MOST_GROUPS
 from copem_replay.report.figures.style import format_per_cent, format_two_decimals
 from copem_replay.report.html.markup import (
@@ -24,6 +23,7 @@ from copem_replay.report.html.markup import (
     make_tag,
 )
 from copem_replay.report.html.tables import column_header, format_value, full_number, interval_markup
+from copem_replay.results.screen import describe_counted
 from copem_replay.results.slices import SHOWN, describe_groups
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def _drives(study: ReportData) -> Iterator[Html]:
     for k, log in enumerate(logs[:MOST_GROUPS]):
         rows = known[known["log"] == log]
         table = _object_table(rows, list(names)) if len(rows) else make_tag("p", "No object counts.")
-        number = count_noun(rows[[*EPISODE]].drop_duplicates().shape[0], "object")
+        number = describe_counted(*count_clusters(rows)[1:])
         yield make_tag("details", make_tag("summary", f"{log}: {number}"), table, id_=f"slices-drive-{k}")
     if len(logs) > MOST_GROUPS:
         yield make_tag("p", f"{len(logs) - MOST_GROUPS} further drives are left out.", class_="below")
