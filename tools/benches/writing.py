@@ -85,8 +85,8 @@ def writing() -> Iterator[common.Line]:
 
         def to_mcap() -> None:
             truth = draw_truth(replayed, table)
-            path, scene = recordings[0].path, ready.scene
-            write_mcap(mcap, path, scene, [(run_tracks, ())], table, {}, truth=truth, colours=colours)
+            chunks, log = [(run_tracks, ())], recordings[0].path
+            write_mcap(mcap, log, ready.scene, chunks, table, {}, truth=truth, colours=colours)
 
         seconds, cpu_s = common.best(to_mcap, 3), common.interleaved([to_mcap], 3)[0]
         yield {"mcap_objects_per_s": round(shown / seconds), "mcap_objects_per_cpu_s": round(shown / cpu_s)}
