@@ -23,9 +23,9 @@ FLOORS = (
     {"__init__"},  # the public API: no wing, and no wing imports it
 )
 MOST_LINES = {
-    "core": 5_300, "io": 12_210, "perception": 3_810, "communication": 1_200, "fusion": 4_200, "metrics": 10_200,
-    "experiment": 4_930, "pipeline": 6_640, "results": 7_400, "viewer": 5_400, "report": 5_260, "api": 1_200,
-    "cli": 1_400, "extras": 14_950,
+    "core": 5_320, "io": 12_350, "perception": 3_820, "communication": 1_200, "fusion": 4_200, "metrics": 10_220,
+    "experiment": 4_930, "pipeline": 6_680, "results": 7_430, "viewer": 5_420, "report": 5_250, "api": 1_200,
+    "cli": 1_380, "extras": 14_950,
 }  # fmt: skip
 """Of a wing. A change that needs more takes something away, or a decision raises the row."""
 SMALL_LINES = 60
