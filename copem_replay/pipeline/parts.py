@@ -43,6 +43,7 @@ from copem_replay.core.waiting import await_server
 from copem_replay.experiment.drive import RecordedLatency, cache_last_experiment
 from copem_replay.experiment.maps import MapFile
 from copem_replay.experiment.schema import Configuration, Experiment
+from copem_replay.io.config import TruthFields, TruthTopic
 from copem_replay.metrics.onset import Requires
 from copem_replay.pipeline.tables import PartTables, pack_part, unpack_part
 
@@ -208,7 +209,7 @@ def write_recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs
     `log`: `StudyLog.identity`. `runs`: from, up to; None for closed forms, which draw nothing.
     """
     data, own = _recipe_parts(experiment, name)
-    return canonical_json(data | {"log": dict(log), "runs": runs, "own": file_digests(own)})
+    return canonical_json(data | {"log": dict(log), "runs": runs, "own": file_digests(own, experiment.read)})
 
 
 @cache_last_experiment
@@ -243,7 +244,8 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
 
 def _list_dependencies(experiment: Experiment, configuration: Configuration) -> list[str]:
     """The units that rows of a configuration depend on, in the experiment's order."""
-    measure, members = experiment.measure, experiment.units_of(configuration)
+    measure, heard = experiment.measure, experiment.units_of(configuration)
+    members = {*heard, *experiment.list_sensing(heard)}
     if measure.onset.requires is not Requires.NOTHING or is_own(
         type(measure.onset)
     ):  # such onsets may ask for visibility
@@ -257,12 +259,16 @@ def own_components(*models: BaseModel | None) -> list[Component | MapFile]:
     return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency | MapFile)]
 
 
-def file_digests(own: Sequence[Component | MapFile]) -> dict[str, str]:
-    """SHA-256 of the files that define own components (not of what they import), of recorded latencies and of maps."""
+def file_digests(own: Sequence[Component | MapFile], read: TruthTopic | TruthFields) -> dict[str, str]:
+    """SHA-256 of the files that define own components (not of what they import), of recorded latencies, of maps, and of
+    definitions of messages.
+    """
     files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
     contents = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
     contents |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
     maps = {one.file: one.sha256 for one in own if isinstance(one, MapFile)}
+    definitions = [] if read.definitions is None else sorted(Path(str(read.definitions)).rglob("*.msg"))
+    contents |= {str(path): path.read_bytes() for path in definitions}
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()} | maps
 
 

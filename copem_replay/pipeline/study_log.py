@@ -210,7 +210,7 @@ def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | Non
             "files": file_stamps(place) if seen is None else seen,
             "ahead_ns": ahead_ns,
             "of": of_all,
-            "own": file_digests(own),
+            "own": file_digests(own, experiment.read),
         }
     )
 

@@ -236,3 +236,27 @@ def test_libraries_and_own_files_are_in_it(tmp_path: Path, monkeypatch: pytest.M
 def test_canonical_json() -> None:
     assert canonical_json({"b": (1.0, 0.1, None), "a": "é"}) == '{"a":"é","b":[1.0,0.1,null]}'
     assert len(recipe_key("x")) == 40
+
+
+def test_a_hub_depends_on_its_members_and_theirs_alone() -> None:
+    """They are in no list of units; the PEM of one changes what the hub lists."""
+
+    def of(member: dict[str, Any], beside: dict[str, Any]) -> str:
+        units = {"a": {"at": [1, 2], "height_m": 5, "pem": "p"}, "c": {"at": [1, 9], "height_m": 5, "pem": "p"}}
+        units = {"a": units["a"] | member, "b": units["a"], "c": units["c"] | beside, "hub": {"fuses": ["a", "b"]}}
+        return key(experiment(units=units, configurations={"mine": {"units": ["hub"]}}, measure={}), "mine")
+
+    before = of({}, {})
+    assert of({"rate_hz": 7}, {}) != before
+    assert of({"pem": "other"}, {}) != before
+    assert of({}, {"rate_hz": 7}) == before
+
+
+def test_definitions_of_messages_are_part_of_the_recipe(tmp_path: Path) -> None:
+    (tmp_path / "my_msgs/msg").mkdir(parents=True)
+    message = tmp_path / "my_msgs/msg/Box.msg"
+    message.write_text("float64 x")
+    asked = experiment(read={"topic": "/boxes", "definitions": str(tmp_path)})
+    before = key(asked)
+    message.write_text("float32 x")
+    assert key(asked) != before
