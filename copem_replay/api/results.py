@@ -175,7 +175,7 @@ def view(
         raise InputError("--log: expected --object ID with it, found none")
     sought = None if object_id is None else Sought(object_id, log)
     if folder.is_file() and folder.suffix == ".rrd" and sought is None and with_recording is None:
-        return _open_sought(folder.absolute().parent, folder.absolute().parent, [folder.absolute()], sought, web=web)
+        return _open_sought(folder.parent, folder.parent, [folder.absolute()], sought, web=web)
     if is_recording(folder):
         raise InputError(
             f"{folder}: expected a results folder, found a recording; `copem-replay run {folder}` makes one"

@@ -534,7 +534,9 @@ class Experiment(Frozen):
 
     def list_sensing(self, names: Iterable[str]) -> tuple[str, ...]:
         """The units, and in place of those that fuse their members."""
-        return tuple(one for name in names for one in (self.units[name].fuses or (name,)))
+        return tuple(
+            one for name in names for one in (self.units[name].fuses or (name,) if name in self.units else (name,))
+        )
 
     @property
     def recorded(self) -> dict[str, RecordedTopic]:

@@ -124,7 +124,7 @@ def _list_named_areas(experiment: Experiment) -> Iterator[tuple[Key, Sequence[st
     """Keys that name areas, and the names."""
     if (within := experiment.measure.objects.within) is not None:
         yield ("measure", "objects", "within", "areas"), within.areas or ()
-    for name in sorted({str(unit.pem) for unit in experiment.modelled.values()}):
+    for name in sorted(experiment.pems.keys() & {unit.pem for unit in experiment.modelled.values()}):
         for k, ghosts in enumerate(experiment.pems[name].ghosts):
             if isinstance(ghosts.where, AreaPlace):
                 yield ("pems", name, "ghosts", k, "where", "areas"), ghosts.where.areas

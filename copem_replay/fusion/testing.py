@@ -339,7 +339,7 @@ class _FusionTrial:
             raise self.broken("answer", scene, wrong)
         for s, k in np.ndindex(len(scene.said), len(inputs.issue_s)) if content_problem(lists, inputs) else ():
             alone = ObjectLists(np.array([[0, len(lists.of(s, k))]]), lists.of(s, k))
-            if wrong := content_problem(alone, replace(inputs, lists=alone, issue_s=inputs.issue_s[k : k + 1])):
+            if wrong := content_problem(alone, replace(inputs, issue_s=inputs.issue_s[k : k + 1])):
                 raise self.broken("answer", scene, wrong, s, float(inputs.issue_s[k]))
         return lists
 

@@ -373,7 +373,7 @@ HOW_MANY = "expected how many units beside the ego's, such as 2 (a count, no nam
 SEEDS = st.integers(-(2**63), 2**64 - 1)
 SEED = "4: seed: expected a whole number of 64 bits (-2^63 … 2^64 - 1), found "
 A_TURN = "expected degrees from -360 to 360"
-EITHER = "expected one of `pem: <name>` and `recorded: {topic: …}`"
+EITHER = "expected one of `pem: <name>`, `recorded: {topic: …}` and `fuses: [<unit>, …]`"
 RECORDED = "recorded: goes with one place, `on` an object or `at` a point, and without rate_hz"
 PLACE = (
     "expected one of `on: ego`, `on: <object id>`, `on: {classes, penetration_rate}`, `at: [x, y]` and "

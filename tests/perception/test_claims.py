@@ -210,7 +210,8 @@ FIELD = "ghosts: [{where: {kind: field, range_m: [0, 9]}, %s}]"
         ),
         (
             "ghosts: [{in_list: 1, where: {kind: anywhere}}]",
-            "ghosts[0].where: kind: expected one of field, places, beside, or package.module:Class; found 'anywhere'",
+            "ghosts[0].where: kind: expected one of field, places, area, beside, or package.module:Class; found "
+            "'anywhere'",
         ),
         ("ghosts: [{in_list: 1, where: {kind: beside, classes: [truck]}}]", "ghosts[0].where.within_m: missing"),
         ("tracks: {lasts_s: 0}", "tracks.lasts_s: expected at least 0.001, found 0"),

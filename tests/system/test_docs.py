@@ -169,7 +169,7 @@ def test_pages_and_notebooks_use_the_public_api_alone() -> None:
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
         code += ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     whole = "\n".join(code)
-    assert re.findall(r"(?:from|import) copem_replay.*", whole) == ["import copem_replay as cr"] * 6
+    assert re.findall(r"(?:from|import) copem_replay.*", whole) == ["import copem_replay as cr"] * 7
     used = set(re.findall(r"\bcr\.(\w+)", whole))
     assert used <= set(cr.__all__)
     assert set(re.findall(r"\bcr\.plot\.(\w+)", whole)) <= set(cr.plot.__all__)
