@@ -50,6 +50,7 @@ class FusedTracks:
     faults: UnitFaults | None = None  # of `received`, in one run: where a unit has outages or ghosts
     stated_s: Float | None = None  # None: the captures that are stated are the true ones
     second_of: Int | None = None  # (P,) the object that each row is a second entry of, −1: none; None: no row is
+    left_out: Bool | None = None  # (R,) rows of `received` that units list and do not send; None: they send all
     by_link: Bool | None = None  # (F,) lists of `received` that units send by a link, in one run; None: there is none
 
     def to_dataframe(self) -> pd.DataFrame:

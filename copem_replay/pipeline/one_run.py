@@ -31,6 +31,7 @@ from copem_replay.pipeline.receiver import (
     make_entry_tracks,
     remove_truth_ids,
     state_captures,
+    states_needed,
 )
 from copem_replay.pipeline.scoring import match_run
 from copem_replay.pipeline.world import Transmission, WorldChunk
@@ -89,6 +90,9 @@ class RunTracks:
                 [(_, fused_tracks)] = output.tracks_by_run(matches)
                 if output.faults is not None:
                     fused_tracks = replace(fused_tracks, faults=output.faults)
+                if units.sends and (states := states_needed(units.configurations[name])) is not None:
+                    left_out = world.listed(states).valid[0] & ~output.sent.valid[0]
+                    fused_tracks = replace(fused_tracks, left_out=left_out)
                 if linked := units.linked(name):
                     fused_tracks = replace(fused_tracks, by_link=_is_sent_by_link(output.sent, linked, group))
                 result[name] = fused_tracks

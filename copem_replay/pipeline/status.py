@@ -11,6 +11,7 @@ that holds for the object and the units of the configuration:
 | out of range or view | no unit has it within the range and view of a couple, or there is no unit |
 | hidden | units have, but would list it only if nothing hid it |
 | in sight | it is in sight of a unit, but no list under way holds it |
+| not sent | a unit's newest list holds it, and `sends` leaves it out of the message |
 | lost | a unit's newest list holds it, and never arrives |
 | under way | a list that holds it is on its way, or waits for the next fused list |
 | unmatched | a unit's newest list that arrived holds it, but no entry of the fused list is matched with it |
@@ -25,7 +26,7 @@ From the onset on a list that was captured before it does not count, unless `cou
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,11 +41,11 @@ from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.sight import ABSENT, Sight, SpanNames, StatusSpan, list_spans, name_bodies, within
 
 STATUSES = (
-    "absent", "not listed", "out of range or view", "hidden", "in sight", "list lost", "on its way", "unmatched",
-    "listed before the onset", "listed, not confirmed", "listed too late", "known",
+    "absent", "not listed", "out of range or view", "hidden", "in sight", "not sent", "list lost", "on its way",
+    "unmatched", "listed before the onset", "listed, not confirmed", "listed too late", "known",
 )  # fmt: skip
 UNLISTED = NO_UNIT
-LOST, UNDER_WAY, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN = range(IN_SIGHT + 1, len(STATUSES))
+NOT_SENT, LOST, UNDER_WAY, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN = range(IN_SIGHT + 1, len(STATUSES))
 """What follows on `ABSENT` and the states of `perception/sight.py`."""
 
 NEVER_NS = np.iinfo(np.int64).max
@@ -121,6 +122,7 @@ def compute_status(
         [_find_object_lists(received, received.units.index(name), k, issued_ns) for name in heard_of]
         for k in sight.object_ix
     ]
+    left_out = None if fused_tracks.left_out is None else replace(received, valid=fused_tracks.left_out[None])
     instants = _find_instants(sight, fused_tracks.fused, listed, clock, replay.scene.end_ns - replay.scene.t0_ns)
     frame = np.searchsorted(sight.elapsed_ns, instants + SAME_INSTANT_NS, side="right") - 1
     shape = (len(instants), len(sight.object_ix))
@@ -142,6 +144,9 @@ def compute_status(
         for name, lists in zip(heard_of, listed[m], strict=True):
             for since_ns, rows in ((-NEVER_NS, instants < counts_ns), (counts_ns, instants >= counts_ns)):
                 counting = lists[0] >= since_ns
+                if left_out is not None:
+                    held_ns, _, all_ns = _find_object_lists(left_out, received.units.index(name), k, issued_ns)
+                    _mark_not_sent(held_ns[held_ns >= since_ns], all_ns, numbers[name], m, rows, statuses)
                 _mark_under_way(
                     lists[0][counting], lists[1][counting], lists[2], numbers.get(name, -1), m, rows, statuses
                 )
@@ -194,6 +199,24 @@ def _frame_period_ns(elapsed_ns: Int) -> int:
     return int(np.median(np.diff(elapsed_ns))) if len(elapsed_ns) > 1 else 100_000_000
 
 
+def _mark_not_sent(captured_ns: Int, stamps_ns: Int, unit: int, m: int, rows: Bool, statuses: Status) -> None:
+    """Fill `rows` of column m of `statuses` where a unit's newest list holds the object, and its message does not."""
+    still, _ = _find_newest(captured_ns, stamps_ns, statuses)
+    not_sent = rows & still & (statuses.status[:, m] < NOT_SENT)
+    statuses.status[not_sent, m], statuses.unit_ix[not_sent, m] = NOT_SENT, unit
+
+
+def _find_newest(captured_ns: Int, stamps_ns: Int, statuses: Status) -> tuple[Bool, Int]:
+    """(K,) at each instant whether the newest list of a unit is one of these, and which of them is the last."""
+    now = statuses.elapsed_ns + SAME_INSTANT_NS
+    sent = np.searchsorted(captured_ns, now, side="right")
+    newest = np.maximum(sent - 1, 0)
+    if not len(captured_ns):
+        return np.zeros(len(now), dtype=bool), newest
+    still = np.searchsorted(stamps_ns, now, "right") == np.searchsorted(stamps_ns, captured_ns[newest], "right")
+    return (sent > 0) & still, newest
+
+
 def _mark_under_way(
     captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m: int, rows: Bool, statuses: Status
 ) -> None:
@@ -204,11 +227,8 @@ def _mark_under_way(
     if not len(captured_ns):
         return
     now, status = statuses.elapsed_ns + SAME_INSTANT_NS, statuses.status[:, m]
-    sent = np.searchsorted(captured_ns, now, side="right")
-    newest = np.maximum(sent - 1, 0)
-    # A lost list counts until the unit captures its next one.
-    still = np.searchsorted(stamps_ns, now, "right") == np.searchsorted(stamps_ns, captured_ns[newest], "right")
-    lost = rows & (sent > 0) & still & np.isinf(arrives_ns[newest]) & (status < LOST)
+    still, newest = _find_newest(captured_ns, stamps_ns, statuses)  # a lost list counts until the unit makes its next
+    lost = rows & still & np.isinf(arrives_ns[newest]) & (status < LOST)
     statuses.status[lost, m], statuses.unit_ix[lost, m] = LOST, unit
     travels = np.isfinite(arrives_ns)
     sent = np.searchsorted(captured_ns[travels], now, side="right")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from copem_replay.core.colours import TRUTH as TRUTH_COLOUR
 from copem_replay.core.colours import Rgb
 from copem_replay.perception.sight import HIDDEN, IN_SIGHT, OUT_OF_VIEW
-from copem_replay.pipeline.status import EARLY, LOST, UNDER_WAY, UNLISTED, UNMATCHED
+from copem_replay.pipeline.status import EARLY, LOST, NOT_SENT, UNDER_WAY, UNLISTED, UNMATCHED
 from copem_replay.viewer.sink import (
     EGO,
     FIELD,
@@ -38,13 +38,13 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
 _FALSE, _DISC = _MARKS[-1][0], "disc: place ± 2σ"
 _STATUSES = {
     OUT_OF_VIEW: "out of range or view", HIDDEN: "hidden", IN_SIGHT: "seen, not listed", UNLISTED: "not listed",
-    LOST: "list lost", UNDER_WAY: "on its way", UNMATCHED: "unmatched",
+    NOT_SENT: "not sent", LOST: "list lost", UNDER_WAY: "on its way", UNMATCHED: "unmatched",
 }  # fmt: skip
 """Words of statuses in lanes, in the order in which they follow each other."""
 _BROAD_POINTS = 4.0
 """Broader bars have their names on them, narrower ones below."""
-LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 7.0)
-"""Bounds of the legend's view: three columns and seven rows."""
+LEGEND_X, LEGEND_Y = (-0.5, 3 * _WIDE + 2 * _GAP + 0.5), (-1.0, 8.0)
+"""Bounds of the legend's view: three columns and eight rows."""
 
 
 def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:

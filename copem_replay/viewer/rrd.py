@@ -478,6 +478,7 @@ class _TrackPieces:
 
     received: list[Tracks] = field(default_factory=list)
     keys: list[Int] = field(default_factory=list)
+    left_out: list[Bool] = field(default_factory=list)
     fused: list[Tracks] = field(default_factory=list)
     source_keys: list[Int] = field(default_factory=list)
     count: list[Int] = field(default_factory=list)
@@ -495,7 +496,7 @@ class TrackCollector:
         """Add the next time chunk's fused tracks, by configuration; rows are copied."""
         for name, fused_tracks in run_tracks.items():
             pieces = self._pieces.setdefault(name, _TrackPieces())
-            self._add_received(pieces, fused_tracks.received)
+            self._add_received(pieces, fused_tracks)
             rows = np.flatnonzero(self._is_of_objects(fused_tracks.fused))
             count = np.diff(fused_tracks.start)[rows]
             within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -510,14 +511,17 @@ class TrackCollector:
         """By configuration, the fused tracks of all time chunks as those of one; without view geometry."""
         return {name: _join_pieces(pieces) for name, pieces in self._pieces.items()}
 
-    def _add_received(self, pieces: _TrackPieces, received: Tracks) -> None:
+    def _add_received(self, pieces: _TrackPieces, fused_tracks: FusedTracks) -> None:
         """Add rows of units' lists that no earlier chunk had: rows captured before a chunk may be in it again."""
+        received = fused_tracks.received
         of_objects, key = self._is_of_objects(received), self._key(received)
         before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
         fresh = np.flatnonzero(of_objects & ~np.isin(key, before))
         rows = received.take_rows(fresh)  # every time chunk has the lists of the whole log: they are kept once
         pieces.received.append(rows.in_lists_of(pieces.received[0] if pieces.received else rows))
         pieces.keys.append(key[fresh])
+        if fused_tracks.left_out is not None:
+            pieces.left_out.append(fused_tracks.left_out[fresh])
 
     def _is_of_objects(self, tracks: Tracks) -> Bool:
         """(P,) whether each row is about one of the objects."""
@@ -532,6 +536,7 @@ class TrackCollector:
 def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
     received, order = splice_rows(pieces.received)
     keys = np.concatenate(pieces.keys)[order]
+    left_out = np.concatenate(pieces.left_out)[order] if pieces.left_out else None
     fused, order = _concatenate_lists(pieces.fused)
     count = np.concatenate(pieces.count)
     begin = np.cumsum(count) - count
@@ -541,7 +546,7 @@ def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
     by_key = np.argsort(keys, kind="stable")
     entries = by_key[np.searchsorted(keys[by_key], source_keys)]
     said = np.concatenate(pieces.said)[order] if pieces.said else None
-    return FusedTracks(fused, received, entries, start, said=said)
+    return FusedTracks(fused, received, entries, start, said=said, left_out=left_out)
 
 
 def _concatenate_lists(fused: Sequence[Tracks]) -> tuple[Tracks, Int]:

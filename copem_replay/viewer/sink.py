@@ -30,7 +30,7 @@ from copem_replay.core.errors import InputError, OutputError
 from copem_replay.core.files import atomic_file
 from copem_replay.core.tracks import CLASSES, Bool, Float, Int, Scene, Tracks
 from copem_replay.perception.sight import HIDDEN, IN_SIGHT, OUT_OF_VIEW
-from copem_replay.pipeline.status import EARLY, KNOWN, LOST, UNDER_WAY, UNLISTED, UNMATCHED, elapsed_ns
+from copem_replay.pipeline.status import EARLY, KNOWN, LOST, NOT_SENT, UNDER_WAY, UNLISTED, UNMATCHED, elapsed_ns
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -66,6 +66,7 @@ STATUS: dict[int, Rgb] = {
     UNLISTED: (92, 76, 48),
     HIDDEN: (205, 160, 100),
     IN_SIGHT: (76, 78, 80),
+    NOT_SENT: (160, 176, 140),
     LOST: (236, 216, 180),
     UNDER_WAY: (140, 165, 225),
     UNMATCHED: (205, 220, 250),

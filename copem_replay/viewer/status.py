@@ -20,6 +20,7 @@ from copem_replay.pipeline.status import (
     EARLY,
     KNOWN,
     LOST,
+    NOT_SENT,
     STATUSES,
     TOO_LATE,
     UNCONFIRMED,
@@ -108,6 +109,7 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
         UNDER_WAY: " on its way",
         UNMATCHED: " unmatched",
         LOST: " list lost",
+        NOT_SENT: " not sent",
         UNLISTED: " not listed",
         IN_SIGHT: " not listed yet" if unit == TRUTH else " not listed",
         HIDDEN: f" behind {hider}",
@@ -128,6 +130,8 @@ def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
         return f"{name} listed by {unit}, no entry matched"
     if status == LOST:
         return f"{name} listed by {unit}, list lost"
+    if status == NOT_SENT:
+        return f"{name} listed by {unit}, left out of its message"
     if status == IN_SIGHT:
         return f"{name} not listed yet" if unit == TRUTH else f"{name} seen by {unit}, not listed"
     if status == UNLISTED:

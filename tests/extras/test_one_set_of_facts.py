@@ -36,7 +36,7 @@ RECORDINGS = ("av2_3b3570b4", "nuscenes_scene0061", "nuscenes_scene0916", "ind_a
 SEEN = ("rate", "outages", "missed", "memory")
 """Causes of an object in sight that is not listed."""
 AFTERWARDS = {
-    "way": ("processing", "queue", "latency", "ticks"), "lost": ("loss",),
+    "way": ("processing", "queue", "latency", "ticks"), "lost": ("loss",), "unsent": ("sends",),
     "unmatched": ("fusion", "pose", "ghosts"), "unconfirmed": ("confirmation", "fusion"),
 }  # fmt: skip
 """Causes of an object that is listed and not yet known."""
@@ -62,6 +62,7 @@ def name_part(words: str) -> tuple[str, str]:
         return "out", ""
     said = {
         "seen by .*, not listed": "seen", "on its way": "way", "list lost": "lost", "unmatched": "unmatched",
+        "not sent": "unsent",
         "listed, not confirmed": "unconfirmed", "not listed": "unlisted", "known": "known",
     }  # fmt: skip
     return next(what for pattern, what in said.items() if re.match(pattern, words)), ""
@@ -139,12 +140,14 @@ units:
   ego: {on: ego, height_m: 1.6, pem: eyes}
   mast: {at: [0, 80], height_m: 5.0, ground_z_m: 0.0, pem: short}
   van: {on: "6", height_m: 2.5, pem: sure}
+  slow: {on: ego, height_m: 1.6, pem: eyes, sends: {interval_s: 1.0}}
 configurations:
   now: {units: [ego]}
   late: {units: [ego, mast], latency_s: 0.5}
   mast: {units: [mast]}
   radio: {units: [van], link: far}
   ticks: {units: [ego], issue_hz: 0.5}
+  sends: {units: [slow]}
 measure:
   objects: {classes: [pedestrian]}
   onset: {kind: at, time_s: 0.0}
@@ -161,13 +164,17 @@ at first and 20 m at .5 s. The mast, 80 m away, has none of them within its 10 m
 
 
 def wait(name: str, object_id: str) -> list[Part]:
-    """From the first list on until the object is known: latency, the next tick of 0.5 Hz, six lists of ten a second."""
+    """From the first list on until the object is known: latency, the next tick of 0.5 Hz, six lists of ten a second.
+
+    Or the next message, of which there is one a second.
+    """
     since_s = BY_HAND[object_id][-1].end_s
-    tick_s = 2.0 * np.ceil(since_s / 2.0)
+    tick_s, message_s = 2.0 * np.ceil(since_s / 2.0), np.ceil(since_s)
     return {
         "now": [], "late": [Part("way", since_s, since_s + 0.5)],
         "confirmed": [Part("unconfirmed", since_s, since_s + 0.5)],
         "ticks": [Part("way", since_s, tick_s)] if tick_s > since_s else [],
+        "sends": [Part("unsent", since_s, message_s)] if message_s > since_s else [],
     }[name]  # fmt: skip
 
 
@@ -196,7 +203,7 @@ def by_hand(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("case", "object_id"), [*product(("now", "late", "ticks", "confirmed"), BY_HAND), ("radio", "7")]
+    ("case", "object_id"), [*product(("now", "late", "ticks", "confirmed", "sends"), BY_HAND), ("radio", "7")]
 )
 def test_by_hand(by_hand: Path, case: str, object_id: str) -> None:
     """`confirmed`: `now`, where six lists in a row are asked for."""
@@ -215,6 +222,7 @@ def test_by_hand(by_hand: Path, case: str, object_id: str) -> None:
     seconds = read_causes(by_hand, [name])[object_id, name]
     added = {cause: of for cause, of in seconds.items() if isinstance(of, float) and of > 1e-9}
     causes = {"out": "range", "hidden": "hidden", "seen": "missed", "lost": "loss", "unconfirmed": "confirmation"}
+    causes["unsent"] = "sends"
     causes["way"] = "ticks" if name == "ticks" else "latency"
     by_cause = {cause: sum_of(expected, what) for what, cause in causes.items()} | {"unknown_s": known_s}
     assert added == pytest.approx({cause: of for cause, of in by_cause.items() if of})
