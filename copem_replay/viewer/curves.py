@@ -308,7 +308,8 @@ def write_differences(
     for name, baseline in baselines.items():
         if name in run_tracks:
             first, second = run_tracks[name].fused, run_tracks[baseline].fused
-            _write_knowledge_points(out, replay, experiment, name, first, baseline, second)
+            pair = {name: colours[name], baseline: colours.get(baseline, DIFFERENCE)}
+            _write_knowledge_points(out, replay, experiment, pair, first, second)
             _write_error_differences(out, replay, experiment, name, first, second, shown, colours[name])
             own, baseline_rows = (table[table["configuration"] == configuration] for configuration in (name, baseline))
             joined = own.merge(baseline_rows, on="object_id", suffixes=("", "_baseline"))
@@ -317,11 +318,15 @@ def write_differences(
 
 
 def _write_knowledge_points(
-    out: RecordingSink, replay: Replay, experiment: Experiment, name: str, first: Tracks, baseline: str, second: Tracks
+    out: RecordingSink, replay: Replay, experiment: Experiment, pair: Mapping[str, Rgb], first: Tracks, second: Tracks
 ) -> None:
-    """Write a point above the true place of each object that only one of the two newest lists holds."""
+    """Write a point above the true place of each object that only one of the two newest lists holds, in its colour.
+
+    `pair`: the configuration and its baseline.
+    """
     import rerun as rr
 
+    name, baseline = pair
     scene = replay.scene
     # Boxes move with the frames of the truth; what is held changes with the lists of both.
     instants = np.unique(
@@ -329,9 +334,9 @@ def _write_knowledge_points(
     )
     held, held_by_baseline = (_is_held(tracks, instants, len(scene.object_ids)) for tracks in (first, second))
     ids = pa.array(scene.object_ids, pa.string())
-    for part, only, size, words in (
-        ("gained", held & ~held_by_baseline, _GAINED_POINTS, f"not in {baseline}"),
-        ("lost", held_by_baseline & ~held, _LOST_POINTS, f"only in {baseline}"),
+    for part, only, size, words, colour in (
+        ("gained", held & ~held_by_baseline, _GAINED_POINTS, f"not in {baseline}", pair[name]),
+        ("lost", held_by_baseline & ~held, _LOST_POINTS, f"only in {baseline}", pair[baseline]),
     ):
         row, object_ix = np.nonzero(only)
         states, present = interpolate_states(
@@ -345,7 +350,7 @@ def _write_knowledge_points(
         path = ["world", configuration_part(name), "difference", part]
         out.columns(path, instants[instants_drawn], columns)
         dot = rr.Radius.ui_points(size)
-        out.static(path, rr.Points3D.from_fields(colors=[DIFFERENCE], radii=dot, show_labels=False))
+        out.static(path, rr.Points3D.from_fields(colors=[colour], radii=dot, show_labels=False))
 
 
 def _is_held(tracks: Tracks, instants: Int, objects: int) -> Bool:

@@ -184,7 +184,8 @@ def write_difference_text(
         first = [tables[0], *([f"**{name}** · {helps[0]}"] if helps[0] else [])]
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
     among = "; what is shown here is among them" if {replay.scene.object_ids[k] for k in shown} & {*too_short} else ""
-    short = [f"Too short to judge: {_escape_cell(', '.join(ids))}{among}."] if ids else []
+    said = "Too short to judge, seen for less than 2 s before or after the onset"
+    short = [f"{said}: {_escape_cell(', '.join(ids))}{among}."] if ids else []
     others = [_escape_cell(line) for line in _describe_others(counted, replay.scene, shown)]
     for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
         text = "\n\n".join([*parts, *others, *short, *_describe_left_out(left_out)])
@@ -192,7 +193,7 @@ def write_difference_text(
 
 
 def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, str]) -> Iterator[str]:
-    """“Shown: 6 of 49 that count. Of the others never known: 134, 99 with late.”; nothing where all are here."""
+    """“Shown: 6 of 49 that count. Of the others never known: object 134, 99 with late.”; nothing where all are here."""
     names, others = (
         counted["configuration"].nunique(),
         counted[~counted["object_id"].isin([scene.object_ids[k] for k in shown])],
@@ -203,7 +204,9 @@ def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, st
     missed = others[~others["detected"].astype(bool)].groupby("object_id", sort=False)["configuration"].unique()
     ids = {name: short_ids(scene)[scene.object_number[name]] for name in missed.index}
     words = [ids[name] + ("" if len(of) == names else f" with {', '.join(of)}") for name, of in missed.items()]
-    yield f"{here}." + (f" Of the others never known: {', '.join(words)}." if words else "")
+    yield f"{here}." + (
+        f" Of the others never known: object{'s' * (len(words) > 1)} {', '.join(words)}." if words else ""
+    )
 
 
 def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:

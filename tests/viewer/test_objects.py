@@ -194,7 +194,9 @@ def test_what_is_too_short_is_listed(tmp_path: Path) -> None:
     )
     made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
     [text] = static(made.path, "/difference")["TextDocument:text"]
-    assert "Shown: 1 of 2 that count.\n\nToo short to judge: 8." in text
+    assert (
+        "Shown: 1 of 2 that count.\n\nToo short to judge, seen for less than 2 s before or after the onset: 8." in text
+    )
     assert "7 car" in text
     assert "8 car" not in text
 
@@ -206,7 +208,7 @@ def test_who_is_never_known_is_said_though_not_shown() -> None:
     rows = rows[rows["configuration"] != "GT"]
     number = replay.scene.object_number
     [line] = _describe_others(rows, replay.scene, {number["near"]: ""})
-    assert line == "Shown: 1 of 3 that count. Of the others never known: beside with x, far."
+    assert line == "Shown: 1 of 3 that count. Of the others never known: objects beside with x, far."
     assert list(_describe_others(rows, replay.scene, {number[name]: "" for name in ("near", "beside", "far")})) == []
 
 
@@ -215,4 +217,7 @@ def test_what_is_shown_all_the_same_is_said_to_be_too_short(tmp_path: Path) -> N
     made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
     [text] = static(made.path, "/difference")["TextDocument:text"]
     assert "8 car" in text
-    assert "Too short to judge: 8; what is shown here is among them." in text
+    assert (
+        "Too short to judge, seen for less than 2 s before or after the onset: 8; what is shown here is among them."
+        in text
+    )

@@ -15,7 +15,7 @@ from copem_replay.extras.stories.story_facts import (
     unit_pose,
     world_at,
 )
-from copem_replay.perception.sight import HIDDEN, IN_SIGHT
+from copem_replay.perception.sight import HIDDEN, IN_SIGHT, NO_UNIT
 from copem_replay.perception.visibility import box_corners
 from copem_replay.pipeline.sight import StatusSpan
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
@@ -191,6 +191,8 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider:
 # Lanes: a row per configuration, the soonest first.
 
 _OUT, _HIDDEN, _IN_SIGHT, _LISTED = "#4d4d4d", "#808080", "#bfbfbf", "#e0e0e0"
+_UNLISTED = "#c8b48c"
+"""Of recorded units, whose views are not known: what they do not list."""
 _SHADES = {"out of range or view": _OUT, "hidden": _HIDDEN, "in sight": _IN_SIGHT, "listed": _LISTED}
 
 
@@ -205,7 +207,9 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
         yield from _draw_lane(story, row, _LANES_TOP + k * each, each - 4, scale)
     y = _LANES_TOP + len(rows) * each + 12
     x = float(_LANE_LEFT)
-    for word, shade in (*_SHADES.items(), ("thick: known (in the colour of the configuration)", None)):
+    unlisted = any(span.status == NO_UNIT for name in kept for span in story.spans.get(name, ()))
+    shades = _SHADES | ({"not listed": _UNLISTED} if unlisted else {})
+    for word, shade in (*shades.items(), ("thick: known (in the colour of the configuration)", None)):
         if shade:
             yield make_tag("rect", x=f"{x:.0f}", y=f"{y - 8:.0f}", width="10", height="9", fill=shade)
         yield make_tag("text", word, x=f"{x + 14:.0f}", y=f"{y:.0f}", class_="label")
@@ -218,7 +222,7 @@ def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: flo
     Known is thicker: some configurations are as grey as what is before.
     """
     known_s, name = story.known_s(row), str(row["configuration"])
-    shades = {HIDDEN: _HIDDEN, IN_SIGHT: _IN_SIGHT}
+    shades = {HIDDEN: _HIDDEN, IN_SIGHT: _IN_SIGHT, NO_UNIT: _UNLISTED}
     thin, thick = ({"y": f"{y + (height - high) / 2:.1f}", "height": f"{high:.1f}"} for high in (height / 2, height))
     yield make_tag(
         "text", story.short[name], x=f"{_LANE_LEFT - 6}", y=f"{y + height - 2:.1f}", class_="label", text_anchor="end"

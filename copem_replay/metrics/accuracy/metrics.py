@@ -121,6 +121,6 @@ ACCURACY = (
     Metric("identity_switches", _TOTAL, lambda of: divide_or_none(of.episodes["switches"], of.tracked_rows), -1,
            "matches by another track than the object's last one, mean per object and run"),
     Metric("longest_gap_s", _TOTAL, lambda of: divide_or_none(of.episodes["longest_gap_s"], of.rows), -1,
-           "longest time for which an object is unknown after its onset, mean", "lists"),
+           "longest time after the onset for which no entry is where the object is now, mean", "lists"),
 )  # fmt: skip
 """The metrics, in the order of their columns."""

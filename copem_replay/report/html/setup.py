@@ -10,7 +10,7 @@ from copem_replay.core.errors import count_noun, name_first
 from copem_replay.core.tracks import TRUTH
 from copem_replay.experiment.schema import Configuration, Experiment, Unit
 from copem_replay.io.window import describe_window
-from copem_replay.metrics.onset import BEGAN, LOG_START, is_counted
+from copem_replay.metrics.onset import BEGAN, LOG_START, has_frame_after, is_counted
 from copem_replay.metrics.summary import DETECTED
 from copem_replay.perception.pem.model import Pem
 from copem_replay.report.html.markup import Html, allow_breaks, fold_parts, join_html, make_list, make_table, make_tag
@@ -234,6 +234,7 @@ def _describe_others(experiment: Experiment, left: pd.DataFrame) -> str:
     what, one = "object" if left["episode"].max() == 0 else "episode", len(left) == 1
     where = "in range" if experiment.measure.onset.kind == "in_range" else "there"
     if (left["began"] == BEGAN[LOG_START]).all() and BEGAN[LOG_START] not in experiment.measure.began:
+        left = left[has_frame_after(left)]  # as the screen of `run` counts them
         was, them = ("was", "it does") if one else ("were", "they do")
         return f" {len(left)} more {what}{'' if one else 's'} {was} {where} when the recording began; {them} not count."
     return (
