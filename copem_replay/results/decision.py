@@ -302,14 +302,14 @@ def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
     for name, pair in sorted(pairs.items(), key=lambda item: -scale.gain(item[1].difference)):
         by_words.setdefault(scale.tell_difference(pair), []).append(name)
     most = _NAMED if len(pairs) > _NAMED + 1 else len(pairs)  # one more takes no more room than to say so
-    shown, left = [], most
+    shown, left, more = [], most, len(pairs) - most
     for words, names in by_words.items():
         kept = names[:left]
         left -= len(kept)
         if kept:
-            listed = " and ".join([", ".join(kept[:-1])] * (len(kept) > 1) + kept[-1:])
+            several = len(kept) > 1 and (words or more <= 0)  # else `and 3 more` ends the list
+            listed = f"{', '.join(kept[:-1])} and {kept[-1]}" if several else ", ".join(kept)
             shown.append(f"{listed} {words}".rstrip())
-    more = len(pairs) - most
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
 
 
