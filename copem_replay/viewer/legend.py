@@ -33,6 +33,7 @@ _MARKS: tuple[tuple[str, Rgb, float], ...] = (
     ("ego", EGO, 6.0),
     ("hides it", HIDES, 2.0),
     ("field of view", FIELD, 1.0),
+    ("thin: second entry", WORDS_COLOUR, 0.5),
     ("false, dashed", WORDS_COLOUR, 0.9),
 )
 _FALSE, _DISC = _MARKS[-1][0], "disc: place ± 2σ"

@@ -59,7 +59,8 @@ def why_parts(tables: Mapping[str, pd.DataFrame]) -> Iterator[Html]:
         yield make_tag(
             "p",
             "Seconds that objects are unknown, in the mean, by cause. Causes are put back one by one in the order in "
-            "which they act, so that what they add sums to the whole.",
+            "which they act, so that what they add sums to the whole, to the end of each episode; the mean time at "
+            "the top counts up to a limit.",
         )
         yield _cause_table(tables["why.csv"], "added_s", "Seconds that each cause adds")
         gained = _cause_table(tables["why.csv"], "gained_s", "Seconds gained if only this cause were gone: no sum")
