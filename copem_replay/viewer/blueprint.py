@@ -73,7 +73,7 @@ class RecordingContent:
     Camera `eye` follows the ego, if there is one, `large` too, in one large view, `eyes` the objects; `above` looks at
     the units, of which `named` have names. `lists`: lists that units send by a link, by configuration. `too_short`: ids
     of objects too short to judge. `opens_s`: the instant at which the recording opens. `counted`: rows of the table
-    that count, of all passes; `false_tracks`: those of `false_tracks.parquet`, None: not known. `brief`: objects that
+    that count, of all passes; `false_tracks`, `needless`: those of these tables, None: not known. `brief`: objects that
     are known too briefly for words in a lane. `of_one`: all configurations are of one experiment. `recorded`: what
     sensors recorded, if shown.
     """
@@ -96,6 +96,7 @@ class RecordingContent:
     opens_s: float | None = None
     counted: pd.DataFrame | None = None
     false_tracks: pd.DataFrame | None = None
+    needless: pd.DataFrame | None = None
     brief: Collection[int] = ()
     of_one: bool = True
     recorded: RecordedSensors | None = None
@@ -114,17 +115,19 @@ class RecordingContent:
         return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations, object_ix in self.brief)
 
     def title(self, configuration: str, mark: str = " · ") -> str:
-        """The title of a view: “bursty · whole run: 18 of 24 known, 3 false”; `mark`: after the name.
+        """“bursty · whole run: 18 of 24 known, 3 false, brakes 1× for nothing”; `mark`: after the name.
 
         Of the objects that count, in all their passes, and of false tracks, where they are known: what tables count.
         """
-        counted, false = (
-            None if of is None else of[of["configuration"] == configuration] for of in (self.counted, self.false_tracks)
+        counted, false, needless = (
+            None if of is None else of[of["configuration"] == configuration]
+            for of in (self.counted, self.false_tracks, self.needless)
         )
         counts = (
             [f"{counted['detected'].sum()} of {len(counted)} known"] if counted is not None and len(counted) else []
         )
         counts += [f"{len(false)} false"] if false is not None else []
+        counts += [f"brakes {len(needless)}× for nothing"] if needless is not None and len(needless) else []
         return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
 
     def tell_false(self) -> str:

@@ -136,7 +136,8 @@ def write_rrd(
         for part in parts:
             content = replace(
                 _build_content(replay, experiment, table, part.configurations, shown, first, baselines),
-                of_one=of_one, counted=counted, false_tracks=false_tracks, recorded=None if files else recorded,
+                of_one=of_one, counted=counted, false_tracks=false_tracks, needless=needless,
+                recorded=None if files else recorded,
             )  # fmt: skip
             identity = (experiment.model_dump_json(), replay.scene.log, str(run), run_is, part.infix)
             # The viewer takes two files of one identity for one recording.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -19,6 +20,7 @@ from copem_replay.report.html.study import load_study
 from copem_replay.results.compare import Comparison, compare_folders
 from copem_replay.results.read import Results, read_results
 from copem_replay.results.screen import format_screen
+from copem_replay.viewer.blueprint import RecordingContent
 from tests.helpers.recordings import Obj, pedestrian, write_recording
 from tests.helpers.scenes import experiment
 from tests.report.test_answer import dots, intervals
@@ -99,6 +101,16 @@ def test_titles_count_what_tables_count(results: Results, folder: Path, false: p
     first = next(line for line in format_screen(results, results.summary, [])[0] if "count" in line)
     assert re.search(r"(\d+) objects", first)
     assert int(re.search(r"(\d+) objects", first)[1]) == results.known["object_id"].nunique()  # type: ignore[index]
+
+
+def test_a_title_says_how_often_the_driver_brakes_for_nothing() -> None:
+    rows = pd.DataFrame({"configuration": ["late", "late", "gnn"]})
+    content = SimpleNamespace(counted=None, false_tracks=rows.iloc[:0], needless=rows)
+    said = [RecordingContent.title(content, name) for name in ("late", "gnn", "ideal")]  # type: ignore[arg-type]
+    assert said == [
+        "late · whole run: 0 false, brakes 2× for nothing", "gnn · whole run: 0 false, brakes 1× for nothing",
+        "ideal · whole run: 0 false",
+    ]  # fmt: skip
 
 
 def test_false_positives_are_the_entries_of_false_tracks(results: Results, false: pd.DataFrame) -> None:
