@@ -148,7 +148,8 @@ def view(
 ) -> None:
     """Open the recordings of a results folder, or one `.rrd` file, in the Rerun viewer, and wait until it ends.
 
-    Each opens just before the first onset.
+    Each opens just before the first onset. Of a recording one run of its draft (`draft_experiment`) is opened, which is
+    kept for as long as the viewer is open.
 
     `object_id`: only recordings with this measured object, just before its onset; `log`: only those of this log.
 
@@ -176,10 +177,8 @@ def view(
     sought = None if object_id is None else Sought(object_id, log)
     if folder.is_file() and folder.suffix == ".rrd" and sought is None and with_recording is None:
         return _open_sought(folder.parent, folder.parent, [folder.absolute()], sought, web=web)
-    if is_recording(folder):
-        raise InputError(
-            f"{folder}: expected a results folder, found a recording; `copem-replay run {folder}` makes one"
-        )
+    if is_recording(folder) and with_recording is None:
+        return _view_draft(folder, web=web, object_id=object_id, log=log)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     check_format(folder)
@@ -191,6 +190,19 @@ def view(
     if not (files := list_rrd_files(folder)):
         raise InputError(f"{folder}: no replay.rrd in this folder; `show: {{run: 0}}` in an experiment writes one")
     return _open_sought(folder, folder, files, sought, web=web)
+
+
+def _view_draft(path: Path, *, web: bool, object_id: str | None, log: str | None) -> None:
+    """Open one run of the draft of a recording."""
+    from copem_replay.api.recordings import draft_experiment
+    from copem_replay.api.run import run
+    from copem_replay.core.yaml import parse_yaml
+
+    draft, _, _ = parse_yaml(draft_experiment(path))
+    with TemporaryDirectory(prefix="copem-replay-") as scratch:
+        run(draft | {"runs": 1}).save(Path(scratch) / "view")
+        print(f"note: {path}: one run of the draft of `init`; `copem-replay run {path}` keeps results", file=sys.stderr)
+        view(Path(scratch) / "view", web=web, object_id=object_id, log=log)
 
 
 def _open_sought(folder: Path, place: Path, files: Sequence[Path], sought: Sought | None, *, web: bool) -> None:

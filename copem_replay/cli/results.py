@@ -305,7 +305,7 @@ def view(
         Path | None, typer.Option("--with", metavar="FILE", help="Add the images and points of this recording.")
     ] = None,
 ) -> int:
-    """Open the recordings of a results folder in the viewer.
+    """Open the recordings of a results folder in the viewer; a .rrd file; or one run of the draft of a recording.
 
     Each opens half a second before the first onset of the objects that tell most, or that of an object.
     """

@@ -1302,6 +1302,17 @@ class TestView:
         assert call("view", "any.rrd") == (0, "", [])
         assert json.loads(viewer.read_text())[4:] == [str(tmp_path / "any.rrd")]
 
+    def test_opens_a_run_of_the_draft_of_a_recording(self, here: Path, call: Call, viewer: Path) -> None:
+        drive(here / "drive.mcap")
+        ended = call("view", "drive.mcap")
+        assert ended.code == 0
+        assert ended.lines[-1] == (
+            "note: drive.mcap: one run of the draft of `init`; `copem-replay run drive.mcap` keeps results"
+        )
+        [opened] = json.loads(viewer.read_text())[4:]
+        assert Path(opened).name == "replay.rrd"
+        assert not Path(opened).exists(), "it is gone with the viewer"
+
     def test_viewer_that_fails(self, tmp_path: Path, call: Call, viewer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "replay.rrd").touch()
         monkeypatch.setenv("VIEWER_ENDS", "3")
@@ -1316,10 +1327,7 @@ class TestView:
             (".", ".: no replay.rrd in this folder; `show: {run: 0}` in an experiment writes one"),
             ("none", "none: no such folder"),
             ("file", "file: no such folder"),
-            (
-                "drive.mcap",
-                "drive.mcap: expected a results folder, found a recording; `copem-replay run drive.mcap` makes one",
-            ),
+            ("drive.mcap", "drive.mcap: no such file"),
         ],
     )
     def test_nothing_to_open(self, tmp_path: Path, call: Call, viewer: Path, folder: str, said: str) -> None:
