@@ -24,7 +24,7 @@ FLOORS = (
 )
 MOST_LINES = {
     "core": 5_320, "io": 12_350, "perception": 3_820, "communication": 1_200, "fusion": 4_200, "metrics": 10_220,
-    "experiment": 4_930, "pipeline": 6_710, "results": 7_430, "viewer": 5_450, "report": 5_250, "api": 1_200,
+    "experiment": 4_930, "pipeline": 6_710, "results": 7_430, "viewer": 5_450, "report": 5_250, "api": 1_210,
     "cli": 1_380, "extras": 14_950,
 }  # fmt: skip
 """Of a wing. A change that needs more takes something away, or a decision raises the row."""
