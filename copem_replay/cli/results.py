@@ -305,9 +305,10 @@ def view(
         Path | None, typer.Option("--with", metavar="FILE", help="Add the images and points of this recording.")
     ] = None,
 ) -> int:
-    """Open the recordings of a results folder in the viewer; a .rrd file; or one run of the draft of a recording.
+    """Open the recordings of a results folder in the viewer.
 
-    Each opens half a second before the first onset of the objects that tell most, or that of an object.
+    A .rrd file opens, too, and of a recording one run of the draft. Each opens half a second before the first onset of
+    the objects that tell most, or that of an object.
     """
     from copem_replay.api.results import view as view_results
 
