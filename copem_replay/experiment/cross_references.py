@@ -127,9 +127,11 @@ def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
             which = "modelled units; recorded ones are named" if names["units"] else "units"
             yield (*key, "units"), f"all: the experiment has no {which}"
         own = modelled if members == "all" else listed or []
-        lasting = (one for one in own if _has_memory(data, _mapping(data, "units", one)))
-        if find_value(configuration, "fusion", "combine") == "posterior" and any(lasting):
-            yield (*key, "fusion", "combine"), "posterior draws anew at each instant and has no memory; use samples"
+        how, posterior = (*key, "fusion", "combine"), find_value(configuration, "fusion", "combine") == "posterior"
+        if posterior and any(_has_memory(data, one) for one in own):
+            yield how, "posterior draws anew at each instant and has no memory; use samples"
+        for one in (one for one in own if posterior and _list_said(data, one, "recorded", "fuses")):
+            yield how, f"posterior draws errors, and what unit {one!r} lists has errors already; use samples"
         if (kind := _fusion_kind(configuration)) is not None and members == TRUTH:
             yield (*key, "fusion"), f"the truth is not fused; {kind} needs units"
         everyone = [TRUTH] if members == TRUTH else [*names["units"], TRUTH]
@@ -155,6 +157,8 @@ def _check_members(data: Mapping[str, Any], _: Names) -> Problems:
             elif isinstance(member.get("on"), dict) or len(places) > 1:
                 what = "is carried by several objects" if isinstance(member.get("on"), dict) else "moves apart from it"
                 yield key, f"unit {one!r} {what}; expected members on one object, or all at places"
+            if _list_said(data, name, "placed") and _list_said(data, one, "recorded"):
+                yield ("units", name, "placed"), f"member {one!r} is recorded; expected members with a PEM"
             for what in ("sends", "clock"):
                 if member.get(what) is not None:
                     yield ("units", one, what), f"what {one!r} lists leaves by {name!r}; say `{what}` there"
@@ -318,9 +322,17 @@ def _fusion_kind(configuration: Mapping[str, Any]) -> str | None:
     return kind if isinstance(kind, str) and kind != "ideal" else None
 
 
-def _has_memory(data: Mapping[str, Any], unit: Mapping[str, Any]) -> bool:
+def _has_memory(data: Mapping[str, Any], unit: str) -> bool:
     """Whether any random draw of a unit lasts, in its PEM or in its own pose."""
-    return unit.get("placed") is not None or bool(_list_memories(data, str(unit.get("pem"))))
+    pems = _list_said(data, unit, "pem")
+    return bool(_list_said(data, unit, "placed")) or any(_list_memories(data, str(pem)) for pem in pems)
+
+
+def _list_said(data: Mapping[str, Any], unit: str, *keys: str) -> list[Any]:
+    """What a unit has at some keys, in the experiment and in single logs."""
+    paths = (("units", unit), ("logs", ITEMS, "units", unit))
+    values = (value for path in paths for key in keys for _, value in find_values(data, *path, key))
+    return [value for value in values if value is not None]
 
 
 def _list_memories(data: Mapping[str, Any], pem: str) -> list[Any]:

@@ -245,9 +245,9 @@ _NOT_RECORDED = {
     "ready": "arrives when its lists say",
     "sends": "sends what is recorded",
 }
-
-
+"""Keys that a recorded unit does not take, and why."""
 _OF_A_SENSOR = ("on", "at", "at_wgs84", "offset_m", "yaw_deg", "height_m", "ground_z_m", "phase_s")
+"""Keys that a unit that fuses does not take: its members have them."""
 
 
 class Unit(Placement):

@@ -20,6 +20,7 @@ from copem_replay.core.tracks import CLASSES, SAME_INSTANT_NS, STATES, VALUES, I
 from copem_replay.experiment.schema import Experiment
 from copem_replay.io.recorded_units import RecordedUnits
 from copem_replay.perception.perceive import displace_rows
+from copem_replay.perception.sensor_poses import compute_unit_poses
 from copem_replay.pipeline.expansion import ExpandedExperiment, RunGroup, expand_members
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.receiver import Receivers
@@ -65,12 +66,14 @@ def _add_pose_errors(log: Replay, lists: Tracks, units: ExpandedExperiment, runs
     for name, unit in units.fusing.items():
         if unit.placed is None or unit.fuses is None:
             continue
-        poses, stamps_ns = log.placed.poses[unit.fuses[0]], log.placed.stamps_ns[unit.fuses[0]]
         rows = np.flatnonzero(lists.row_unit_ix == lists.units.index(name))
-        nearest = np.searchsorted(stamps_ns, lists.stamp_ns[lists.frame_ix[rows]], side="right") - 1
-        at_m = np.stack([poses.x_m[nearest], poses.y_m[nearest]])
-        away_m = np.stack([lists.x_m[0, rows], lists.y_m[0, rows]]) - at_m
-        lists = displace_rows(log.scene, lists, rows, at_m, away_m, unit.placed, (units.seed, name, runs))
+        poses = compute_unit_poses(log.scene, units.units[unit.fuses[0]], log.truth, ground_m=0.0)
+        if len(rows):  # then it is there at least once
+            times_s, there = lists.row_captured_s[rows], poses.present
+            places = (axis[there] for axis in (poses.x_m, poses.y_m))
+            at_m = np.stack([np.interp(times_s, log.truth.captured_s[there], place) for place in places])
+            away_m = np.stack([lists.x_m[0, rows], lists.y_m[0, rows]]) - at_m
+            lists = displace_rows(log.scene, lists, rows, at_m, away_m, unit.placed, (units.seed, name, runs))
     return lists
 
 

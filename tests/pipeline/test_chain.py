@@ -145,6 +145,32 @@ def test_errors_of_pose_move_a_list_as_a_whole(tmp_path: Path) -> None:
     np.testing.assert_allclose(entries["cov_ee_m2"], 0.49, rtol=1e-6)
 
 
+def test_a_heading_turns_a_list_about_the_first_member_where_it_is_at_the_capture(tmp_path: Path) -> None:
+    """The ego drives at 10 m/s; its slow member, which is the first, lists from half a second on."""
+    frames = [
+        (k / 10, [Obj(id=1, x=-30.0 + k, vx=10.0), pedestrian(2, 20.0, 1.0), pedestrian(3, 15.0, -9.0)])
+        for k in range(21)
+    ]
+    path = write_recording(tmp_path / "drive.mcap", frames, host=1)
+    units = {
+        "a": {"on": "ego", "pem": "p", "rate_hz": 1, "phase_s": 0.5, "offset_m": [1.5, 0.0]},
+        "b": {"on": "ego", "pem": "p"},
+    }
+    fused = []
+    for keys in ({}, {"placed": {"yaw_sigma_deg": 5.0}}):
+        hub = {"fuses": ["a", "b"]} | keys
+        plan = {"pems": {"p": SURE}, "units": units | {"hub": hub}, "configurations": {"x": {"units": ["hub"]}}}
+        entries = tracks(path, plan)["x"].to_dataframe().set_index(["available_s", "object_id"])
+        fused.append((entries["x_m"] + 1j * entries["y_m"]).unstack())
+    true, listed = fused
+    assert len(true) > 20
+    unit = -30.0 + 10.0 * np.minimum(true.index.to_numpy(), 2.0) + 1.5
+    turn = np.angle((listed["2"] - unit) / (true["2"] - unit))
+    assert np.std(turn) > np.deg2rad(2.0)
+    expected = unit[:, None] + (true - unit[:, None]) * np.exp(1j * turn)[:, None]
+    np.testing.assert_allclose(listed, expected, rtol=0, atol=1e-4)  # lists of one instant are 2 µs apart
+
+
 def test_sends_outages_and_clock_are_those_of_the_unit(tmp_path: Path) -> None:
     path = line(tmp_path / "line.mcap")
     mast = {"fuses": ["a", "b"], "fusion": {"kind": "gnn"}}
@@ -199,6 +225,10 @@ REFUSED = {
     "with a member": ({"mast": {"fuses": ["a", "b"]}}, "configurations.x.units[1]: unit 'a' comes by 'mast' already"),
     "a place": ({"mast": {"fuses": ["a"], "at": [0, 0]}},
                 "units.mast.at: a unit that fuses is where its first member is"),
+    "a pose, and a recorded member": (
+        {"r": {"recorded": {"topic": "x"}}, "mast": {"fuses": ["a", "r"], "placed": {"yaw_sigma_deg": 1}}},
+        "units.mast.placed: member 'r' is recorded; expected members with a PEM",
+    ),
     "no members": ({"mast": {"fuses": []}}, "units.mast.fuses"),
     "a fusion alone": ({"a": TWO["a"] | {"fusion": {"kind": "gnn"}}},
                        "units.a.fusion: only for a unit that `fuses` others"),
@@ -217,6 +247,22 @@ def test_what_cannot_be_fused_is_refused_in_a_line(tmp_path: Path, which: str) -
     with pytest.raises(ExperimentError) as refused:
         cr.load_experiment(plan)
     assert any(message in line for line in str(refused.value).splitlines()), refused.value
+
+
+def test_errors_are_not_drawn_again(tmp_path: Path) -> None:
+    """`posterior` draws them from what a PEM says; what a unit fused, or recorded, in one log at least, has them."""
+    mast, message = {"fuses": ["a", "b"]}, "posterior draws errors, and what unit {!r} lists has errors already"
+    plan = {
+        "version": 1, "logs": ["x.mcap", {"file": "y.mcap", "units": {"c": {"recorded": {"topic": "x"}}}}],
+        "pems": {"p": SURE}, "units": TWO | {"mast": mast, "c": TWO["a"], "r": {"recorded": {"topic": "y"}}},
+        "configurations": {"x": {"units": ["mast", "c", "r"], "fusion": {"kind": "ideal", "combine": "posterior"}}},
+    }  # fmt: skip
+    with pytest.raises(ExperimentError) as refused:
+        cr.load_experiment(plan)
+    found = [line for line in str(refused.value).splitlines() if "posterior" in line]
+    expected = [f"configurations.x.fusion.combine: {message.format(name)}; use samples" for name in ("mast", "c", "r")]
+    assert len(found) == 3
+    assert all(line.endswith(one) for line, one in zip(sorted(found), sorted(expected), strict=True))
 
 
 def test_exact_times_are_refused(tmp_path: Path) -> None:
