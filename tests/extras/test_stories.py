@@ -100,6 +100,7 @@ def test_lists_that_the_radio_loses_are_told(tmp_path: Path) -> None:
     assert after_s > 0.2
     words = Page(build_page(load_study(folder))).words
     assert f"half: list lost until {after_s:.2f} s, known after {after_s:.2f} s, by the ego's own list" in words
+    assert "is not told" not in words
 
 
 def test_what_became_of_lists_is_not_told_of_a_run_that_comes_out_otherwise(
@@ -115,6 +116,7 @@ def test_what_became_of_lists_is_not_told_of_a_run_that_comes_out_otherwise(
     words = Page(build_page(load_study(folder))).words
     assert re.search(r"half: known after [0-9.]+ s, by the ego's own list", words)
     assert "lost until" not in words
+    assert "What becomes of lists is not told: the run cannot be replayed again as it was." in words
 
 
 def test_stories_are_in_the_report_and_without_the_recording_the_reason(tmp_path: Path) -> None:

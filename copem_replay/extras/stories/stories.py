@@ -56,6 +56,8 @@ def story_parts(study: ReportData) -> list[Html]:
     short = f" Too short to judge, seen for less than 2 s before or after the onset: {named}" if too_short else ""
     short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
+    if told and not any(spans.values()):
+        parts.append(make_tag("p", "What becomes of lists is not told: the run cannot be replayed again as it was."))
     for name, of in told.items():
         parts.append(_story_element(ObjectStory(study, drive, of, spans[name])))
     return parts
