@@ -14,8 +14,19 @@ import numpy as np
 import pytest
 
 from copem_replay.core.colours import configuration_colours
-from copem_replay.core.tracks import Solid
-from copem_replay.pipeline.status import STATUSES
+from copem_replay.core.tracks import Solid, Tracks
+from copem_replay.pipeline.sight import compute_sight
+from copem_replay.pipeline.status import (
+    IN_SIGHT,
+    KNOWN,
+    LOST,
+    STATUSES,
+    UNDER_WAY,
+    UNMATCHED,
+    Status,
+    compute_status,
+    read_episode_clocks,
+)
 from copem_replay.viewer.sink import slice_by_frame, split_into_files
 from tests.helpers.scenes import EGO_UNIT, Thing, driving, recording, standing
 from tests.viewer.test_line_of_sight import PERSON, SECTOR, WALL, lines
@@ -415,11 +426,6 @@ def titles(path: Path) -> set[str]:
 
 
 def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
-    from dataclasses import replace
-
-    from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.pipeline.status import KNOWN, LOST, UNDER_WAY, compute_status, read_episode_clocks
-
     fused_tracks = hiding.run_tracks["both"]
     # Pedestrian 4 is in the pole's lists only: those of the first half of a second never arrive.
     arrives = np.where(fused_tracks.received.captured_s < 0.45, np.inf, fused_tracks.received.arrives_s)
@@ -438,20 +444,18 @@ def test_a_list_that_never_arrives_is_lost(hiding: Made) -> None:
     assert UNDER_WAY not in made.status
 
 
-def test_a_list_that_arrives_after_the_last_fused_one_is_on_its_way(hiding: Made) -> None:
-    from dataclasses import replace
-
-    from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.pipeline.status import UNDER_WAY, compute_status, read_episode_clocks
-
+def fused_by_nobody(hiding: Made, received: Tracks) -> Status:
+    """The status of pedestrian 4 with `both`, which receives these lists and fuses nothing."""
     tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
-    received = replace(tracks.received, arrives_s=tracks.received.captured_s[None] + 10.0)
-    nothing = replace(tracks.fused, valid=np.zeros_like(tracks.fused.valid))
-    seen = compute_sight(hiding.replay, hiding.given, [number])
+    nothing = replace(tracks, received=received, fused=replace(tracks.fused, valid=np.zeros_like(tracks.fused.valid)))
     clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
-    made = compute_status(
-        hiding.replay, hiding.given, "both", replace(tracks, received=received, fused=nothing), seen, clock
-    )
+    sight = compute_sight(hiding.replay, hiding.given, [number])
+    return compute_status(hiding.replay, hiding.given, "both", nothing, sight, clock)
+
+
+def test_a_list_that_arrives_after_the_last_fused_one_is_on_its_way(hiding: Made) -> None:
+    received = hiding.run_tracks["both"].received
+    made = fused_by_nobody(hiding, replace(received, arrives_s=received.captured_s[None] + 10.0))
     there = made.elapsed_ns < 2_000_000_000
     assert set(made.status[there, 0].tolist()) == {UNDER_WAY}
     assert made.until_s[0, 0] == pytest.approx(10.0)
@@ -460,23 +464,12 @@ def test_a_list_that_arrives_after_the_last_fused_one_is_on_its_way(hiding: Made
 @pytest.mark.parametrize("arrives", [False, True])
 def test_what_a_units_next_list_no_longer_holds_is_neither_lost_nor_unmatched(hiding: Made, arrives: bool) -> None:
     """Two lists of the pole hold pedestrian 4, at 0 and 0.1 s, the next ones do not; no fused list ever does."""
-    from dataclasses import replace
-
-    from copem_replay.pipeline.sight import compute_sight
-    from copem_replay.pipeline.status import IN_SIGHT, LOST, UNMATCHED, compute_status, read_episode_clocks
-
-    fused_tracks, number = hiding.run_tracks["both"], hiding.replay.scene.object_number["4"]
-    received = fused_tracks.received
+    received, number = hiding.run_tracks["both"].received, hiding.replay.scene.object_number["4"]
     late = received.captured_s[received.frame_ix] > 0.15
     received = replace(received, valid=received.valid & ~(late & (received.row_object_ix == number)))
     if not arrives:
         received = replace(received, arrives_s=np.full_like(received.arrives_s, np.inf))
-    nothing = replace(fused_tracks.fused, valid=np.zeros_like(fused_tracks.fused.valid))
-    seen = compute_sight(hiding.replay, hiding.given, [number])
-    clock = read_episode_clocks(hiding.replay.scene, hiding.table.assign(detected=False, detection_s=np.nan), "both")
-    made = compute_status(
-        hiding.replay, hiding.given, "both", replace(fused_tracks, received=received, fused=nothing), seen, clock
-    )
+    made = fused_by_nobody(hiding, received)
     early = made.elapsed_ns < 199_000_000
     assert {STATUSES[k] for k in made.status[early, 0]} == {STATUSES[UNMATCHED if arrives else LOST]}
     assert {STATUSES[k] for k in made.status[~early, 0]} == {STATUSES[IN_SIGHT]}
