@@ -51,6 +51,7 @@ from copem_replay.fusion.interface import Fusion, IdealFusion
 from copem_replay.io.config import Ego, HowRead, RecordedOutput, RecordedTopic, TruthTopic, WindowOf
 from copem_replay.metrics.config import AREA, Braking, Measure, Needless, OwnArea, parse_slices
 from copem_replay.perception.config import Carriers, Obstacle, Placement, Rate
+from copem_replay.perception.pem.condition import Condition
 from copem_replay.perception.pem.model import MeanNumber, Pem
 from copem_replay.perception.visibility import Surface, Visibility
 
@@ -253,15 +254,17 @@ _OF_A_SENSOR = ("on", "at", "at_wgs84", "offset_m", "yaw_deg", "height_m", "grou
 class Unit(Placement):
     """A perception unit: its place, and the PEM or the `recorded` topic of its lists, or the units that it `fuses`.
 
-    A recorded unit has no PEM, and needs a place only where distances are measured from it. `ready`: processing time
-    from capture until a list can be sent; `sends`: which lists and objects it sends. A unit that fuses lists what its
-    `fusion` makes of its members' lists, whenever one comes, or at `rate_hz`; `max_age_s`: how old a list it uses.
+    A recorded unit has no PEM, and needs a place only where distances are measured from it, or for `views`: where its
+    sensors look, so that what hides an object from it is known. `ready`: processing time from capture until a list can
+    be sent; `sends`: which lists and objects it sends. A unit that fuses lists what its `fusion` makes of its members'
+    lists, whenever one comes, or at `rate_hz`; `max_age_s`: how old a list it uses.
 
     >>> cr.Unit(at=(12.0, -4.5), yaw_deg=90.0, height_m=5.0, pem="camera").rate_hz is None
     True
     """
 
     recorded: RecordedTopic | None = None
+    views: Annotated[tuple[Condition, ...], Field(min_length=1)] | None = _UNSAID
     fuses: Annotated[tuple[Id, ...], Field(min_length=1)] | None = _UNSAID
     fusion: Annotated[Fusion, Slot("fusion", FUSIONS, "ideal")] | None = _UNSAID
     max_age_s: Positive | None = _UNSAID
@@ -274,6 +277,8 @@ class Unit(Placement):
             raise ValueError("expected one of `pem: <name>`, `recorded: {topic: …}` and `fuses: [<unit>, …]`")
         places = (self.on, self.at, self.at_wgs84)
         self._check_fusing()
+        if self.views is not None:
+            self._check_views()
         if self.at_wgs84 is not None and len(self.at_wgs84) == 3 and "yaw_deg" in self.model_fields_set:
             raise error_at_key("yaw_deg", "the heading is the third number of at_wgs84; expected one of both")
         if self.recorded is not None:
@@ -296,6 +301,13 @@ class Unit(Placement):
         if self.phase_s and self.rate_hz is None:
             raise ValueError("phase_s: needs rate_hz (without it there is one list per frame of the truth)")
         return self
+
+    def _check_views(self) -> None:
+        """Raises ValueError for `views` of a unit that is not recorded, or has no place to look from."""
+        if self.recorded is None:
+            raise error_at_key("views", "only for a recorded unit; a PEM says by its conditions where its unit looks")
+        if self.on is None and (self.height_m is None or not (self.at or self.at_wgs84)):
+            raise error_at_key("views", "where from? expected `on: <object>`, or `at: [x, y]` with `height_m`")
 
     def _check_fusing(self) -> None:
         """Raises ValueError for keys of a unit that fuses where none does, and for those that it does not take."""

@@ -1,4 +1,4 @@
-"""Lists of stations (CPM, SDSM): brought from their station into the log, and their times.
+"""Lists of stations (CPM, SDSM): brought from their station into the log, their times, and where sensors look.
 
 A list is captured when most of its objects were measured, and arrives when it was logged: a station sends no time of
 arrival. Objects that were measured at other times are moved to the capture along their velocity.
@@ -6,18 +6,25 @@ arrival. Objects that were measured at other times are moved to the capture alon
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from copem_replay.core.errors import InputError, RecordingError, count_noun
 from copem_replay.core.frame import Frame
-from copem_replay.core.tracks import Bool, Int
+from copem_replay.core.tracks import Bool, Float, Int
+from copem_replay.io.channel import DefinitionError, schema_name
+from copem_replay.io.encodings import make_definition
+from copem_replay.io.encodings.columns import shred_messages
 from copem_replay.io.findings import VX, VY, find
 from copem_replay.io.frames import SampledPoses, transform_rows
 from copem_replay.io.ground_truth import take_messages
+from copem_replay.io.log import Log, gather_messages
 from copem_replay.io.schemas.object_lists import DecodedLists, Station
+from copem_replay.io.schemas.v2x import CPM, PLACE_PATHS, SENSOR_PATHS, View, find_views
 from copem_replay.io.stamps import SLACK_NS
 
 
@@ -29,7 +36,7 @@ def place_on_earth(lists: DecodedLists, station: Station, frame: Frame | None, p
     if frame is None:
         why = "its positions are relative to stations on earth, and the log does not say where it is"
         raise RecordingError(f"{why}: give `frame: {{proj: …}}` (docs/guide/place.md)", path=path, topic=topic)
-    known: Bool = np.all(np.abs(station.place) <= (90.0, 180.0), axis=1)
+    known = _is_on_earth(station.place)
     if len(known) and not known.any():
         missing = count_noun(len(known), "message")
         raise RecordingError(f"none of its {missing} has the reference position of its station", path=path, topic=topic)
@@ -48,6 +55,12 @@ def place_on_earth(lists: DecodedLists, station: Station, frame: Frame | None, p
     values, covariance = transform_rows(values, lists.covariance_m2, placed, instant)
     notes = (*lists.columns.notes, *find("no station", int((~known).sum())))
     return replace(lists, columns=replace(lists.columns, values=values, notes=notes), covariance_m2=covariance)
+
+
+def _is_on_earth(place_deg: Float) -> Bool:
+    """(F,) whether latitudes and longitudes (F, 2) are ones; others say that there is none."""
+    known: Bool = np.all(np.abs(place_deg) <= (90.0, 180.0), axis=1)
+    return known
 
 
 def _take_messages(lists: DecodedLists, kept: Bool) -> DecodedLists:
@@ -85,3 +98,38 @@ def settle_measurements(
     notes += find("older", int((~kept).sum()))
     arrived = replace(columns, values=values, stamp_ns=columns.log_time_ns, notes=tuple(notes))
     return _take_messages(replace(lists, columns=arrived), kept), (captured_ns[kept], said[kept])
+
+
+class StationViews(NamedTuple):
+    """Where a station stands, latitude and longitude, and where its sensors look; `why` that is not known."""
+
+    place_deg: tuple[float, float]
+    views: tuple[View, ...]
+    why: str
+
+
+_STANDS_DEG = 2e-5
+"""A station moves if its places differ by more: 2 m."""
+
+
+def read_station_views(log: Log, topic: str) -> StationViews | None:
+    """What the CPMs on a topic say of their station's sensors; None: nothing."""
+    views, places, why = dict[View, None](), list[Float](), ""
+    for channel in (c for c in log.channels if c.topic == topic and c.messages and schema_name(c) == CPM):
+        payloads = gather_messages(log, frozenset({channel.number})).payloads[channel.number]
+        with suppress(DefinitionError, KeyError):  # other fields than published ones, or too much memory
+            found = shred_messages(make_definition(channel, payloads), payloads, [*SENSOR_PATHS, *PLACE_PATHS])
+            seen, unread = find_views(found)
+            views |= dict.fromkeys(seen)
+            places.append(np.stack([found.levels[""].numbers[path] / 1e7 for path in PLACE_PATHS], axis=1))
+            why = why or unread
+    if not (views or why):
+        return None
+    at_deg = np.concatenate(places)
+    at_deg = at_deg[_is_on_earth(at_deg)]
+    if not len(at_deg):
+        return None
+    if (np.ptp(at_deg, axis=0) > _STANDS_DEG).any():
+        why = "its messages are from several places; expected a station that stands"
+    lat, lon = np.median(at_deg, axis=0).tolist()
+    return StationViews((lat, lon), () if why else tuple(views), why)

@@ -158,8 +158,8 @@ _DETECTIONS = (
     Column("captured_s", "numbers", "newest capture that contributed to that list"),
     Column("in_sight_s", "numbers",
            "the first list, captured at or after the onset, of any of the configuration's units that has the object in "
-           "sight: within range and view, and not hidden. Null if never, or not known (for the truth and with recorded "
-           "units)"),
+           "sight: within range and view, and not hidden. Null if never, or not known (for the truth, and with "
+           "recorded units without `views`)"),
     Column("out_of_view_s", "numbers",
            "from the onset until a unit first lists the object, or the episode's end: seconds in which it is out of "
            "range or view of all of the configuration's units; null where `in_sight_s` is not known"),

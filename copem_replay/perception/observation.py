@@ -194,8 +194,8 @@ def interpolate_worlds(
 ) -> Iterator[tuple[list[str], Tracks]]:
     """The world at the lists of the modelled units: names of units with equal list instants, and the world there."""
     names_by_stamps: dict[bytes, list[str]] = {}
-    for name, stamps in placed.stamps_ns.items():
-        names_by_stamps.setdefault(stamps.tobytes(), []).append(name)
+    for name in experiment.modelled:
+        names_by_stamps.setdefault(placed.stamps_ns[name].tobytes(), []).append(name)
     for names in names_by_stamps.values():
         if experiment.units[names[0]].rate_hz is None:
             yield names, truth.captured_between(from_s, until_s)

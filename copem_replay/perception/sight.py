@@ -43,7 +43,7 @@ def judge_sight(pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags:
 
 @dataclass(frozen=True)
 class SightSpans:
-    """Spans (K,) of one state, by episode and begin: of single units, `unit_ix` of the modelled ones, or of several.
+    """Spans (K,) of one state, by episode and begin: of single units, `unit_ix` of those that look, or of several.
 
     `end_s` is inf where nothing follows.
     """
@@ -86,7 +86,7 @@ class SightSpans:
 
 
 class SightChanges(NamedTuple):
-    """The lists (K,) of modelled units in which the state of an episode is another than in the unit's list before."""
+    """The lists (K,) of units in which the state of an episode is another than in the unit's list before."""
 
     unit_ix: Int
     episode_ix: Int
@@ -99,18 +99,24 @@ class SightChanges(NamedTuple):
 
 
 def find_sight_changes(
-    observations: Observations, experiment: PerceptionSetup, tags: Mapping[str, str], episode_ix: Int
+    observations: Observations,
+    experiment: PerceptionSetup,
+    tags: Mapping[str, str],
+    episode_ix: Int,
+    units: Sequence[str],
 ) -> SightChanges:
-    """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none."""
+    """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none.
+
+    `units`: the names that `unit_ix` numbers.
+    """
     tracks = observations.tracks
+    unit_ix = np.array([units.index(name) for name in tracks.units], dtype=np.int64)[tracks.row_unit_ix]
     state = np.full(len(episode_ix), NO_UNIT)
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         rows = rows[episode_ix[rows] >= 0]
         state[rows] = judge_sight(str(unit.pem), experiment, observations.view.take(rows), tags)
     rows = np.flatnonzero(episode_ix >= 0)
-    return _keep_changes(
-        SightChanges(tracks.row_unit_ix[rows], episode_ix[rows], tracks.row_captured_s[rows], state[rows])
-    )
+    return _keep_changes(SightChanges(unit_ix[rows], episode_ix[rows], tracks.row_captured_s[rows], state[rows]))
 
 
 def _keep_changes(lists: SightChanges) -> SightChanges:
@@ -135,7 +141,7 @@ def join_sight_changes(chunks: Sequence[SightChanges], onset_s: Float) -> SightS
 class SightTimes(NamedTuple):
     """Of one configuration, all (S | 1, M): when it first has each object in sight, and seconds before it is listed.
 
-    NaN: never, or not known: the truth needs no sight, and recorded units do not tell.
+    NaN: never, or not known: the truth needs no sight, and recorded units without `views` do not tell.
     """
 
     in_sight_s: Float

@@ -11,6 +11,7 @@ What a configuration is, by truth id, fixed, or regretted to which ideal, is dec
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -27,6 +28,11 @@ from copem_replay.io.config import RecordedOutput
 from copem_replay.metrics.braking.driver import ConstantReaction
 from copem_replay.metrics.onset import Requires
 from copem_replay.perception.config import Carriers
+from copem_replay.perception.pem.condition import Couple
+from copem_replay.perception.pem.detection import ConstantDetection
+from copem_replay.perception.pem.model import Pem
+
+E = TypeVar("E", bound=Experiment)
 
 # What configurations are.
 
@@ -326,6 +332,22 @@ def expand_members(experiment: ExpandedExperiment) -> ExpandedExperiment:
         {names[k]: experiment.units[names[k]] for k in kept},
         tuple(experiment.named[k] for k in kept), tuple(experiment.carrier[k] for k in kept), experiment.share[kept],
     )  # fmt: skip
+
+
+def give_views(experiment: E, *, alone: bool = False) -> E:
+    """The experiment in which recorded units with `views` have a PEM instead that lists all they see: for sight alone.
+
+    `alone`: without other units. An experiment without such units is given back.
+    """
+    views = {name: unit.views for name, unit in experiment.units.items() if unit.views is not None}
+    if not views:
+        return experiment
+    pem, as_sensor = "views of {}".format, {"recorded": None, "views": None}
+    sensors = {name: experiment.units[name].model_copy(update={**as_sensor, "pem": pem(name)}) for name in views}
+    sure = ConstantDetection.model_validate({"probability": 1.0})
+    sees = {pem(name): Pem(couples=tuple(Couple(when=when, detection=sure) for when in views[name])) for name in views}
+    units = sensors if alone else {**experiment.units, **sensors}
+    return experiment.model_copy(update={"units": units, "pems": {**experiment.pems, **sees}})
 
 
 def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput) -> Configuration:

@@ -55,7 +55,7 @@ from copem_replay.metrics.episodes import (
 from copem_replay.perception.observation import KeptShares, Observations, join_observations, observe_objects
 from copem_replay.perception.sensor_poses import SensorPoses, list_instants, place_units
 from copem_replay.perception.sight import SightSpans, find_sight_changes, join_sight_changes
-from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment
+from copem_replay.pipeline.expansion import ExpandedExperiment, expand_alike, expand_experiment, give_views
 
 T = TypeVar("T")
 
@@ -254,9 +254,14 @@ class Replay:
         """The episodes of this log by another `measure`."""
         return _find_kept_episodes(self.scene, self.truth, self.placed, experiment)[0]
 
+    @cached_property
+    def sighted(self) -> ExpandedExperiment:
+        """The experiment in which recorded units with `views` have a PEM."""
+        return give_views(self.expanded)
+
     @property
     def sight_spans(self) -> SightSpans:
-        """What each modelled unit has of each episode, from list to list."""
+        """What each unit that is known to look has of each episode, from list to list."""
         return self._overview[0]
 
     @property
@@ -267,11 +272,16 @@ class Replay:
     @cached_property
     def _overview(self) -> tuple[SightSpans, Bool, int]:
         """`sight_spans`, `ever_met`, and the number of observation rows of objects that have an episode."""
-        changes, met, rows = [], list[Bool](), 0
+        changes, met, rows, units = [], list[Bool](), 0, list(self.sighted.modelled)
+        viewing = give_views(self.expanded, alone=True)
         for chunk in self.chunks:
             observations = self.observe(chunk)
-            numbers = self.episodes.number_rows(observations.tracks)
-            changes.append(find_sight_changes(observations, self.expanded, self.scene.tags, numbers))
+            looks = [(observations, self.expanded)]
+            if viewing is not self.expanded:
+                looks.append((self._observe_with(viewing, chunk), viewing))
+            for seen, by in looks:
+                numbers = self.episodes.number_rows(seen.tracks)
+                changes.append(find_sight_changes(seen, by, self.scene.tags, numbers, units))
             met.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
         return join_sight_changes(changes, self.episodes.onset_s), np.any(met, axis=0), rows
@@ -329,6 +339,11 @@ class Replay:
             self.scene, self.truth, self.expanded, self.placed, from_s=from_s, until_s=chunk.until_s, **how
         )
         return replace(observed, tracks=observed.tracks.in_lists_of(self.no_rows.tracks))
+
+    def _observe_with(self, viewing: ExpandedExperiment, chunk: TimeChunk) -> Observations:
+        return observe_objects(
+            self.scene, self.truth, viewing, self.placed, from_s=chunk.from_s, until_s=chunk.until_s, as_read=True
+        )
 
     def observe_listable(self, chunk: TimeChunk, from_s: float, *, complete: bool) -> Observations:
         """The rows that can be listed, captured from `from_s` on; of all objects, or only of those with an episode."""
@@ -420,7 +435,7 @@ def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Expe
     truth = interpolate_at_instants(
         recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
     )
-    placed = place_units(scene, truth, expanded)
+    placed = place_units(scene, truth, give_views(expanded))
     lists = {name: observations for name, observations in recording.lists.items() if name in expanded.units}
     recorded = join_recorded_units(
         lists, scene, truth, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s

@@ -219,5 +219,5 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
         way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (made.common_arrives_s, arriving)))
     until_s = np.fmin(np.fmin(listed_s, detections.captured_s), log.episodes.ended_s)
     sensing = None if of_truth else units.list_sensing(names)
-    sight = measure_sight(log.sight_spans, units, sensing, lists.group.listing, until_s)
+    sight = measure_sight(log.sight_spans, log.sighted, sensing, lists.group.listing, until_s)
     return DetectionEvents(received.units, detections, sight, way=way)

@@ -29,6 +29,7 @@ from copem_replay.perception.sensor_poses import (
 )
 from copem_replay.perception.sight import HIDDEN, NO_UNIT, judge_sight
 from copem_replay.perception.visibility import VisibilityModel, find_blockers, visible_shares
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.pipeline.one_run import BY_ANY, BY_EGO, Curve
 from copem_replay.pipeline.prepare import Replay
 
@@ -43,9 +44,9 @@ ROWS_AT_ONCE = 60_000
 class Sight:
     """Objects (M,) as seen from the experiment's units (U,) at frames of the truth (K,).
 
-    `state`: `ABSENT` of objects that are not there, and of recorded units, too. `share`: NaN outside the unit's field
-    of view, while the unit is absent, and for its carrier. `body_ix`: the object that hides most of a hidden object, or
-    −1 − k for the solid k; `body_m`: its centre.
+    `state`: `ABSENT` of objects that are not there, and of recorded units without `views`. `share`: NaN outside the
+    unit's field of view, while the unit is absent, and for its carrier. `body_ix`: the object that hides most of a
+    hidden object, or −1 − k for the solid k; `body_m`: its centre.
     """
 
     elapsed_ns: Int  # (K,)
@@ -167,10 +168,10 @@ def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
 def list_sight_spans(
     replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
 ) -> list[StatusSpan]:
-    """What the units `names` have of object m between two instants; nothing of recorded units."""
+    """What the units `names` have of object m between two instants; nothing of recorded units without `views`."""
     every = list(replay.expanded.units)
     sensing = replay.expanded.list_sensing(names)
-    units = [every.index(name) for name in sensing if name in replay.expanded.modelled]
+    units = [every.index(name) for name in sensing if name in replay.sighted.modelled]
     frames = within(sight.elapsed_ns, from_s, until_s)
     if not units or not len(frames):
         return []
@@ -193,7 +194,7 @@ def compute_sight(
 
     `observed`: observations whose visible shares are taken instead of being computed again.
     """
-    scene, truth = replay.scene, replay.truth
+    scene, truth, experiment = replay.scene, replay.truth, give_views(experiment)
     stamps = truth.stamp_ns[np.unique(truth.frame_ix[np.isin(truth.row_object_ix, shown)])]
     shape = (len(experiment.units), len(stamps), len(shown))
     sight = Sight(

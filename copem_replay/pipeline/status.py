@@ -7,7 +7,7 @@ that holds for the object and the units of the configuration:
 | status | holds when |
 |---|---|
 | absent | the object is not in the log |
-| not listed | it is; the lists of the units are recorded, so what they can see is unknown |
+| not listed | it is; the lists of the units are recorded, and do not say where they look (`views`) |
 | out of range or view | no unit has it within the range and view of a couple, or there is no unit |
 | hidden | units have, but would list it only if nothing hid it |
 | in sight | it is in sight of a unit, but no list under way holds it |
@@ -116,7 +116,7 @@ def compute_status(
         [TRUTH] if of_truth else [name for name in experiment.units_of(asked_configuration) if name in received.units]
     )
     sensing = [] if of_truth else experiment.list_sensing(heard_of)
-    modelled = [numbers[name] for name in sensing if name in experiment.modelled]
+    modelled = [numbers[name] for name in sensing if name in replay.sighted.modelled]
     issued_ns = np.append(elapsed_ns(fused_tracks.fused), np.inf)
     listed = [
         [_find_object_lists(received, received.units.index(name), k, issued_ns) for name in heard_of]

@@ -6,6 +6,7 @@ What an entity looks like is told once, and where it is in every frame: in colum
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from copem_replay.core.tracks import CLASSES, FROM_MAP, Float, Int, Scene, Track
 from copem_replay.io.write.message_family import EGO_FRAME, MIDDLE_FRAME
 from copem_replay.io.write.scene import Ellipse, Entity, Line, MovingEntities, Place, Pose, Rgba, Text, TruthScene
 from copem_replay.perception.sensor_poses import couple_outlines, mounting_height
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.pipeline.one_run import ReplayedRun
 
 BODY: Rgba = (0.62, 0.62, 0.62, 1.0)
@@ -33,9 +35,9 @@ _MARK_M, _ABOVE_M = 0.5, 0.05
 
 def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
     """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
-    replay, modelled = replayed.replay, replayed.experiment.modelled
+    replay, replayed = replayed.replay, replace(replayed, experiment=give_views(replayed.experiment))
     static = [*_draw_obstacles(replayed), *_draw_lanes(replayed)]
-    for name, unit in modelled.items():
+    for name, unit in replayed.experiment.modelled.items():
         if unit.at is not None and len(replay.placed.stamps_ns[name]):
             poses = replay.placed.poses[name]
             pose = Pose(*(float(column[0]) for column in (poses.x_m, poses.y_m, poses.z_m, poses.heading_rad)))

@@ -21,6 +21,7 @@ from copem_replay.perception.sensor_poses import (
     mounting_height,
     unit_ground,
 )
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.pipeline.prepare import Replay
 from copem_replay.pipeline.status import to_nanoseconds
 from copem_replay.viewer.sink import EGO, FIELD, RecordingSink, stack_float32
@@ -45,6 +46,7 @@ def write_units(out: RecordingSink, replay: Replay, experiment: Experiment) -> N
     """A point and a field of view for each unit; neither while its carrier is absent. Names show on selection."""
     import rerun as rr
 
+    experiment = give_views(experiment)
     for name, unit in experiment.units.items():
         path = ["world", "units", name]
         mark = rr.Radius.ui_points(MARK_POINTS)

@@ -30,7 +30,27 @@ _OF_CPM = {
     ),
     "Vehicle": "Angle orientation_angle; Angle pitch_angle; bool pitch_angle_is_present",
     "Sensors": "Sensor[] array",
-    "Sensor": "U8 sensor_id; U8 sensor_type; bool shadowing_applies",
+    "Sensor": (
+        "U8 sensor_id; U8 sensor_type; Shape perception_region_shape; bool perception_region_shape_is_present;"
+        "U8 perception_region_confidence; bool perception_region_confidence_is_present; bool shadowing_applies"
+    ),
+    "Shape": (
+        "uint8 choice; uint8 CHOICE_RECTANGULAR=0; Circle circular; uint8 CHOICE_CIRCULAR=1; Radial radial;"
+        "uint8 CHOICE_RADIAL=4; Radials radial_shapes; uint8 CHOICE_RADIAL_SHAPES=5"
+    ),
+    "Circle": "Point shape_reference_point; bool shape_reference_point_is_present; U16 radius; U16 height",
+    "Radial": (
+        "Point shape_reference_point; bool shape_reference_point_is_present; U16 range;"
+        "U16 stationary_horizontal_opening_angle_start; U16 stationary_horizontal_opening_angle_end;"
+        "U16 vertical_opening_angle_start; bool vertical_opening_angle_start_is_present"
+    ),
+    "Radials": (
+        "U8 ref_point_id; I32 x_coordinate; I32 y_coordinate; I32 z_coordinate; bool z_coordinate_is_present;"
+        "RadialsList radial_shapes_list"
+    ),
+    "RadialsList": "RadialDetails[] array",
+    "RadialDetails": "U16 range; U16 horizontal_opening_angle_start; U16 horizontal_opening_angle_end",
+    "Point": "I32 x_coordinate; I32 y_coordinate; I32 z_coordinate; bool z_coordinate_is_present",
     "PerceivedObjectContainer": "U8 number_of_perceived_objects; PerceivedObjects perceived_objects",
     "PerceivedObjects": "PerceivedObject[] array",
     "PerceivedObject": (
@@ -165,16 +185,40 @@ def polar(speed: int, tenths: int) -> dict[str, Any]:
     return {"choice": 0, "polar_velocity": {"velocity_magnitude": fast, "velocity_direction": measured(tenths)}}
 
 
-def cpm_message(its_ms: int, lat: float, lon: float, *objects: dict[str, Any], station: int = 7) -> dict[str, Any]:
-    """A container of a vehicle, and one of objects."""
+def sector(range_dm: int, start: int, end: int, east_cm: int = 0) -> dict[str, Any]:
+    """A sensor with a sector clockwise from north, in dm and tenths of a degree."""
+    angles = {f"stationary_horizontal_opening_angle_{of}": value(at) for of, at in (("start", start), ("end", end))}
+    about = {"shape_reference_point": {"x_coordinate": value(east_cm)}, "shape_reference_point_is_present": True}
+    return shaped(4, radial={"range": value(range_dm)} | angles | (about if east_cm else {}))
+
+
+def sectors(*ranges_and_angles: tuple[int, int, int]) -> dict[str, Any]:
+    """A sensor with sectors counter-clockwise from east."""
+    names = ("range", "horizontal_opening_angle_start", "horizontal_opening_angle_end")
+    parts = [dict(zip(names, map(value, part), strict=True)) for part in ranges_and_angles]
+    return shaped(5, radial_shapes={"radial_shapes_list": {"array": parts}})
+
+
+def shaped(choice: int, **shape: Any) -> dict[str, Any]:
+    region = {"choice": choice, **shape}
+    return {"sensor_id": value(1), "perception_region_shape": region, "perception_region_shape_is_present": True}
+
+
+def cpm_message(
+    its_ms: int, lat: float, lon: float, *objects: dict[str, Any], station: int = 7, sensors: Any = None
+) -> dict[str, Any]:
+    """A container of sensors, or of a vehicle, and one of objects."""
     of = {"number_of_perceived_objects": value(len(objects)), "perceived_objects": {"array": list(objects)}}
     full = {"container_id": value(5), "container_data_perceived_object_container": of}
     place = {"latitude": value(round(lat * 1e7)), "longitude": value(round(lon * 1e7))}
+    before = {"container_id": value(1)}
+    if sensors is not None:
+        before = {"container_id": value(3), "container_data_sensor_information_container": {"array": sensors}}
     return {
         "header": {"station_id": value(station)},
         "payload": {
             "management_container": {"reference_time": value(its_ms), "reference_position": place},
-            "cpm_containers": {"value": {"array": [{"container_id": value(1)}, full]}},
+            "cpm_containers": {"value": {"array": [before, full]}},
         },
     }
 

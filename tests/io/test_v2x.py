@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from osi3.osi_groundtruth_pb2 import GroundTruth
 from pyproj import Geod, Transformer
 
+import copem_replay as cr
 from copem_replay.cli.main import main
 from copem_replay.core.frame import Frame, make_local_proj
 from copem_replay.core.tracks import CLASSES
@@ -23,6 +25,7 @@ from copem_replay.io.recording import read_log
 from copem_replay.io.schemas.object_lists import DecodedLists, decode_lists
 from copem_replay.io.schemas.registry import SCHEMAS
 from copem_replay.io.schemas.v2x import convert_its_time
+from copem_replay.io.stations import read_station_views
 from tests.helpers.messages import classes, ids, serialised, values
 from tests.helpers.recordings import Obj, Topic, ns, write_mcap, write_recording
 from tests.helpers.v2x import (
@@ -38,6 +41,9 @@ from tests.helpers.v2x import (
     polar,
     sdsm_message,
     sdsm_object,
+    sector,
+    sectors,
+    shaped,
     value,
 )  # fmt: skip
 
@@ -434,3 +440,80 @@ def test_without_a_folder_the_line_names_the_key(
     monkeypatch.chdir(silent.parent)
     check(silent.parent, PLAN.replace("read: {definitions: DEFINITIONS}\n", ""), monkeypatch)
     assert "`read: {definitions: FOLDER}` names a folder that has it" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------ sensors
+
+
+def looking(path: Path, *sensors: dict[str, Any], lat: tuple[float, ...] = (LAT,), late_s: float = 1.6) -> Path:
+    """`drive` on earth, with messages of a station and its sensors, the car in those from `late_s` on."""
+    messages = [
+        (t_s, cpm_message(its_ms(t_s), lat[k % len(lat)], LON, *about, sensors=list(sensors)))
+        for k, t_s in enumerate(np.arange(5, 19) / 10)
+        for about in [[cpm_object(3, 2000, round(100 * (10 * (t_s - 0.05) - 10)))] if t_s > late_s else []]
+    ]
+    truth = next(iter(open_log(drive(path.with_suffix(".bare.mcap"), *messages)).channels))
+    here = []
+    for _, log_ns, data in open_log(path.with_suffix(".bare.mcap")).payloads(frozenset({truth.number})):
+        message = GroundTruth.FromString(data)
+        message.proj_string = HERE.proj
+        here.append((log_ns, message.SerializeToString(deterministic=True)))
+    return write_mcap(path, [Topic("truth", "osi3.GroundTruth", here), topic_of(*messages)])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "views"),
+    [
+        (sector(800, 450, 800), [((0, 80), (-80, -45))]),  # north-east
+        (sector(800, 3500, 100), [((0, 80), (-10, -350))]),  # 20° through north
+        (sectors((500, 100, 450), (300, 3300, 300)), [((0, 30), (240, -60)), ((0, 50), (-80, -45))]),  # from east
+        (shaped(1, circular={"radius": value(300)}), [((0, 30), (-360, 0))]),
+    ],
+)
+def test_sensors_of_a_cpm_are_views(tmp_path: Path, sensor: dict[str, Any], views: Any) -> None:
+    path = looking(tmp_path / "a.mcap", sensor)
+    said = read_station_views(open_log(path), "cpm")
+    assert said is not None
+    assert (said.place_deg, said.why) == ((LAT, LON), "")
+    assert sorted(said.views) == sorted(views)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "lat", "why"),
+    [
+        ([sector(800, 450, 800, east_cm=1500)], (LAT,), "a sensor is 15 m from its station; expected a unit for each"),
+        ([sector(800, 450, 3601)], (LAT,), "a sensor does not state its angles"),
+        ([sector(800, 450, 800), shaped(2)], (LAT,), "a sensor's region is neither a sector nor a circle"),
+        ([sector(800, 450, 800)], (LAT, LAT + 1e-4), "its messages are from several places; expected a station that"),
+    ],
+)
+def test_sensors_that_are_no_views_say_why(
+    tmp_path: Path, sensors: list[dict[str, Any]], lat: tuple[float, ...], why: str
+) -> None:
+    draft = cr.draft_experiment(looking(tmp_path / "a.mcap", *sensors, lat=lat))
+    assert f"    # views: left out: {why}" in draft
+    assert "    views:" not in draft
+
+
+def test_a_vehicle_has_no_views_and_without_sensors_there_is_nothing_to_say(tmp_path: Path) -> None:
+    assert read_station_views(open_log(drive(tmp_path / "none.mcap", seen(0.5))), "cpm") is None
+    assert "views:" not in cr.draft_experiment(looking(tmp_path / "bare.mcap"))
+    time_s, message = seen(0.5)
+    containers = message["payload"]["cpm_containers"]["value"]["array"]
+    containers.append({"container_data_sensor_information_container": {"array": [sector(800, 450, 800)]}})
+    said = read_station_views(open_log(drive(tmp_path / "a.mcap", (time_s, message))), "cpm")
+    assert said is not None
+    assert (said.views, said.why) == ((), "its station is a vehicle; expected one that stands")
+
+
+def test_a_draft_has_the_views_and_knows_when_the_car_is_in_sight(tmp_path: Path) -> None:
+    """The car is 20 m east: in the sector from 45° to 80° once it is 3.5 m north, from 1.353 s on."""
+    path = looking(tmp_path / "a.mcap", sector(800, 450, 800))
+    draft = cr.draft_experiment(path)
+    assert "      - {range_m: [0.0, 80.0], azimuth_deg: [-80.0, -45.0]}" in draft
+    (tmp_path / "a.yaml").write_text(draft)
+    rows = cr.run(tmp_path / "a.yaml").detections.query("configuration == 'cpm' and object_id == '2' and run == 0")
+    (row,) = rows.to_dict("records")
+    assert row["in_sight_s"] == pytest.approx(1.4)
+    assert row["out_of_view_s"] == pytest.approx(1.4)
+    assert row["hidden_s"] == 0

@@ -53,6 +53,9 @@ class UnitFound:
     delay: str | None = None  # the delay in words, or that it cannot be told; None: lists state their capture
     oddities: list[str] = field(default_factory=list)  # one line each
     middle_m: list[float] = field(default_factory=lambda: [0.0, 0.0])  # x, y: of the area in which it lists objects
+    at_wgs84: list[float] | None = None  # of a station: latitude, longitude
+    views: list[dict[str, list[float]]] = field(default_factory=list)  # where its sensors look, north ahead
+    no_views: str = ""  # why what its sensors say is no view
 
 
 @dataclass(frozen=True)

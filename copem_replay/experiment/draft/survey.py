@@ -130,7 +130,18 @@ def _survey_units(
             yield UnitFound(topic, problem="; ".join(error.within(first_recording(place), topic)))
             continue
         known = _compare_with_truth(recording, lists) if recording is not None and len(lists.tracks.stamp_ns) else {}
-        yield _survey_unit(topic, lists, known)
+        yield _survey_unit(topic, lists, known | _survey_sensors(place, topic))
+
+
+def _survey_sensors(place: Local, topic: str) -> dict[str, Any]:
+    """Where the sensors of a station look, as fields of `UnitFound`."""
+    from copem_replay.io.stations import read_station_views
+
+    said = open_log(place).attempt(lambda log: read_station_views(log, topic))
+    if said is None:
+        return {}
+    views = [{"range_m": list(range_m), "azimuth_deg": list(azimuth_deg)} for range_m, azimuth_deg in said.views]
+    return {"at_wgs84": list(said.place_deg), "views": views, "no_views": said.why}
 
 
 def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> UnitFound:

@@ -327,6 +327,14 @@ def _draft_units(drives: Sequence[_Drive], units: Sequence[str], recorded: Mappi
         yield f"  {name}:"
         yield f"    recorded: {_format_recorded(unit)}{late}"
         place, what = dump_on_one_line(unit.middle_m), "where is it? x, y as in the log"
+        if unit.views and unit.at_wgs84:
+            yield f"    at_wgs84: {dump_on_one_line([*unit.at_wgs84, 0.0])}   # where it says it stands, north ahead"
+            yield "    height_m: 6.0   # a guess"
+            yield "    views:   # where its sensors look, as it says: what hides an object from it is known"
+            yield from (f"      - {dump_on_one_line(view)}" for view in unit.views)
+            continue
+        if unit.no_views:
+            yield f"    # views: left out: {unit.no_views}"
         if any(name in drive.lists and not drive.has_ego for drive in drives):
             yield f"    at: {place}   # a guess, the middle of what it lists: {what}"
         else:

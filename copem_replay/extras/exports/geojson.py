@@ -23,6 +23,7 @@ from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.experiment.schema import Experiment, Unit
 from copem_replay.io.recording import Recording
 from copem_replay.perception.sensor_poses import couple_outlines
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.results.outputs import made_files
 from copem_replay.results.read import Results, open_results
 
@@ -95,6 +96,7 @@ def _write_ring(frame: Frame, corners_m: Any, *, hole: bool = False) -> list[lis
 
 def _list_units(log: str, experiment: Experiment, frame: Frame) -> Iterator[dict[str, Any]]:
     """A point for each unit that stands, and the fields of its PEM."""
+    experiment = give_views(experiment)
     for name, unit in experiment.units.items():
         if unit.at is None:
             continue

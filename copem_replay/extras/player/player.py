@@ -20,6 +20,7 @@ from copem_replay.core.fused_tracks import FusedTracks
 from copem_replay.core.tracks import CLASSES, SAME_INSTANT_S, Bool, Float, Int, Scene, Tracks
 from copem_replay.experiment.drive import resolve_for_log
 from copem_replay.metrics.detections_table import first_episodes
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.report.figures.selection import Choice, Selection, choose_object_and_run, find_differing
 from copem_replay.report.figures.style import sort_soonest_first
 from copem_replay.report.html.markup import Html, css_colour, join_html, make_tag
@@ -271,7 +272,9 @@ def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:
     """Units with a place of their own: name, x and y, m from the middle."""
     poses = replayed.replay.placed.poses
     fixed = (
-        name for name, unit in replayed.experiment.modelled.items() if unit.at is not None and len(poses[name].x_m)
+        name
+        for name, unit in give_views(replayed.experiment).modelled.items()
+        if unit.at is not None and len(poses[name].x_m)
     )
     east_m, north_m = grid.middle_m
     return [

@@ -17,6 +17,7 @@ from copem_replay.extras.stories.story_facts import (
 )
 from copem_replay.perception.sight import HIDDEN, IN_SIGHT, NO_UNIT
 from copem_replay.perception.visibility import box_corners
+from copem_replay.pipeline.expansion import give_views
 from copem_replay.pipeline.sight import StatusSpan
 from copem_replay.report.html.markup import Html, css_colour, make_tag, replace_colours, replace_greys
 from copem_replay.results.shown_objects import pick_evenly
@@ -176,11 +177,12 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider:
     hidden_from = hider.unit if hider and hider.begin_s <= story.onset_s + SAME_INSTANT_S else None
     name = hidden_from if row is None else row.get("first_unit")
     target = _places(world, drive.scene.object_number[story.object_id])
-    if not isinstance(name, str) or name not in drive.experiment.modelled or not len(target):
+    sensors = give_views(drive.experiment).modelled
+    if not isinstance(name, str) or name not in sensors or not len(target):
         return
     if row is not None and not row["detected"]:
         return
-    poses = unit_pose(drive, name, drive.experiment.modelled[name], world)
+    poses = unit_pose(drive, name, sensors[name], world)
     if poses.present.any():
         line = view.points(np.array([[poses.x_m[0], poses.y_m[0]], target[0]]))
         colour = _HIDER if row is None else css_colour(story.study.looks[str(row["configuration"])].colour)
@@ -192,7 +194,7 @@ def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider:
 
 _OUT, _HIDDEN, _IN_SIGHT, _LISTED = "#4d4d4d", "#808080", "#bfbfbf", "#e0e0e0"
 _UNLISTED = "#c8b48c"
-"""Of recorded units, whose views are not known: what they do not list."""
+"""Of recorded units without `views`: what they do not list."""
 _SHADES = {"out of range or view": _OUT, "hidden": _HIDDEN, "in sight": _IN_SIGHT, "listed": _LISTED}
 
 

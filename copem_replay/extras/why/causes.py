@@ -339,10 +339,10 @@ class Counterfactuals:
         equipped = expanded.equipped(ready.scene.log, runs)
         there = np.ones((1, len(expanded.units)), dtype=bool) if equipped is None else equipped
         found = measure_sight(
-            ready.sight_spans, expanded, expanded.list_sensing(expanded.units_of(one)), there, until_s
+            ready.sight_spans, ready.sighted, expanded.list_sensing(expanded.units_of(one)), there, until_s
         )
-        seconds = {"range": found.out_of_view_s, "hidden": found.hidden_s}
-        return {name: np.broadcast_to(of, until_s.shape)[run, place] for name, of in seconds.items()}
+        seconds = {"range": found.out_of_view_s, "hidden": found.hidden_s}  # NaN: a unit does not say where it looks
+        return {name: np.broadcast_to(np.nan_to_num(of), until_s.shape)[run, place] for name, of in seconds.items()}
 
     def _find_ready(self, experiment: Experiment) -> Replay:
         """The log made ready for an experiment; what is observed is kept while there is room for it."""
@@ -384,15 +384,12 @@ def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
     causes, recorded = list_causes(replays.only), bool(replays.only.recorded)
     chain, whole = [cause for cause in causes if cause.name not in _SIGHT], replays.unknown_s(())
 
-    def sight_s(after_s: Float) -> dict[str, Float]:
-        return dict.fromkeys(_SIGHT, np.zeros_like(after_s)) if recorded else replays.sight_s(chain, after_s)
-
     known = replays.unknown_s(chain)
-    sight = sight_s(known)
+    sight = replays.sight_s(chain, known)
     added = {RECORDED if recorded else NO_UNIT: known - sum(sight.values())}
     for k, cause in enumerate(chain):
         later = replays.unknown_s(chain[k + 1 :])
-        then = sight_s(later) if cause.name in _BEFORE_LISTED else sight
+        then = replays.sight_s(chain, later) if cause.name in _BEFORE_LISTED else sight
         added[cause.name] = later - known - sum(then[name] - sight[name] for name in _SIGHT)
         known, sight = later, then
     added |= {name: of for name, of in sight.items() if of.any() or any(cause.name == name for cause in causes)}

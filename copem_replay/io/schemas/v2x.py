@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from copem_replay.core.tracks import Bool, Float
+from copem_replay.io.encodings.columns import ShreddedMessages, ancestor_rows, list_level
 from copem_replay.io.schemas.description import ClassField, Description, Fields, Made, Stamp
 
 _SIGMAS_95: Final = 1.959963984540054
@@ -116,6 +117,72 @@ def cpm(offers: Collection[str]) -> Description:
         made[f"{side}_m"] = (_scale(10, 0, 255, 256), f"{size}.value.value", f"{size}_is_present")
     path, share = f"{of_class}.class", f"{of_class}.share"
     return _describe(objects, "object_id.value", "/header.station_id.value", path, _CPM_CLASSES, share, made)
+
+
+# Sensors of a station.
+
+CPM: Final = "etsi_its_cpm_ts_msgs/msg/CollectivePerceptionMessage"
+PLACE_PATHS: Final = tuple(
+    f"payload.management_container.reference_position.{axis}.value" for axis in ("latitude", "longitude")
+)
+_CONTAINER: Final = "payload.cpm_containers.value.array[]"
+_SENSOR: Final = f"{_CONTAINER}.container_data_sensor_information_container.array[]"
+_SHAPE: Final = f"{_SENSOR}.perception_region_shape"
+_CIRCLE, _RADIAL, _SECTORS = f"{_SHAPE}.circular", f"{_SHAPE}.radial", f"{_SHAPE}.radial_shapes"
+_SECTOR: Final = f"{_SECTORS}.radial_shapes_list.array[]"
+_REGIONS: Final = {
+    1: (f"{_CIRCLE}.shape_reference_point", f"{_CIRCLE}.radius", ""),
+    4: (f"{_RADIAL}.shape_reference_point", f"{_RADIAL}.range", f"{_RADIAL}.stationary_horizontal_opening_angle"),
+    5: (_SECTORS, f"{_SECTOR}.range", f"{_SECTOR}.horizontal_opening_angle"),
+}
+"""By choice of a shape the paths of its middle, of its radius, and of the angles between which it is."""
+_KIND: Final = (f"{_CONTAINER}.container_id.value", f"{_SENSOR}.perception_region_shape_is_present", f"{_SHAPE}.choice")
+_VEHICLE_CONTAINER: Final = 1
+_AT_STATION_M: Final = 2.0
+
+
+def _region_paths(choice: int) -> tuple[list[str], list[str]]:
+    """The paths of the middle of a region, and of its radius and angles."""
+    middle, radius, angle = _REGIONS[choice]
+    ends = [f"{angle}_{end}.value" for end in ("start", "end") if angle]
+    return [f"{middle}.{axis}_coordinate.value" for axis in "xy"], [f"{radius}.value", *ends]
+
+
+SENSOR_PATHS: Final = (*_KIND, *(path for choice in _REGIONS for paths in _region_paths(choice) for path in paths))
+
+View = tuple[tuple[float, float], tuple[float, float]]
+"""Distances in m from and to, and azimuths in degrees from and to, counter-clockwise from north."""
+
+
+def find_views(found: ShreddedMessages) -> tuple[list[View], str]:
+    """Where the sensors of a station that stands look, seen from the station, and why that is not all of it.
+
+    Angles of `radial` are clockwise from north, those of `radial_shapes` counter-clockwise from the x axis, which is
+    east (TS 102 894-2, Wgs84AngleValue and CartesianAngleValue).
+    """
+    containers, *of_sensors = (found.levels[list_level(path)].numbers[path] for path in _KIND)
+    choice, views, why = np.where(of_sensors[0] != 0, of_sensors[1], -1), dict[View, None](), ""
+    if (containers == _VEHICLE_CONTAINER).any() and (choice >= 0).any():
+        return [], "its station is a vehicle; expected one that stands"
+    if not np.isin(choice, (-1, *_REGIONS)).all():
+        why = "a sensor's region is neither a sector nor a circle"
+    for kind in _REGIONS:
+        middle, numbers = _region_paths(kind)
+        level = list_level(numbers[0])
+        sensor = ancestor_rows(found, level, _SENSOR)
+        rows = np.flatnonzero(choice[sensor] == kind)
+        away_m = np.hypot(*(found.levels[_SENSOR].numbers[path][sensor[rows]] / 100 for path in middle))
+        if (away_m > _AT_STATION_M).any():
+            why = f"a sensor is {away_m.max():.0f} m from its station; expected a unit for each such sensor"
+        for radius, *angles in np.unique(
+            [found.levels[level].numbers[path][rows] for path in numbers], axis=1
+        ).T.tolist():
+            if any(angle > 3600 for angle in angles):
+                why = "a sensor does not state its angles"
+            first, last = angles or (0, 3600)
+            turned = (first / 10 - 90, last / 10 - 90) if kind == 5 else (-last / 10, -first / 10)
+            views[(0.0, radius / 10), turned] = None
+    return list(views), why
 
 
 # SDSM.

@@ -17,8 +17,8 @@ the object is on its way, belong to *listed* where the instants of lists on thei
 Without these instants, ideal fusion and the truth know an object from the list that brings it (one hit): all time from
 the capture on is transport. Otherwise transport is the latency if all units have one latency; if not, transport and
 fusion are one stage, *since captured*. The first three stages are one, *until captured*, if it is unknown what units
-have in sight: for the truth, and for recorded units. With `count_earlier` times may be negative, and the figure is
-not drawn.
+have in sight: for the truth, and for recorded units without `views`. With `count_earlier` times may be negative, and
+the figure is not drawn.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ STAGES = {
     IN_SIGHT: "the rest of that time: missed by the perception, between two lists, and, where it is not known when it "
     "was first listed, not yet confirmed, or in a list that was still on its way",
     UNTIL_CAPTURED: "from the start of the clock until that capture, where it is not known when the object was in "
-    "sight: the truth needs no sight, and recorded units do not tell",
+    "sight: the truth needs no sight, and recorded units tell by their `views` alone",
     LISTED: "where lists come by a link, or of units with ready or sends, the last part of that time: from the capture "
     "of the first list that has the object, which was not sent, lost, overtaken, still on its way, not enough to "
     "confirm it, or taken in together with a newer one",
