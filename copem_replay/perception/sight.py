@@ -99,24 +99,18 @@ class SightChanges(NamedTuple):
 
 
 def find_sight_changes(
-    observations: Observations,
-    experiment: PerceptionSetup,
-    tags: Mapping[str, str],
-    episode_ix: Int,
-    units: Sequence[str],
+    observations: Observations, experiment: PerceptionSetup, tags: Mapping[str, str], episode_ix: Int
 ) -> SightChanges:
-    """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none.
-
-    `units`: the names that `unit_ix` numbers.
-    """
+    """The changes in the lists of a time chunk. `tags`: those of the log; `episode_ix (P,)`: of each row, −1: none."""
     tracks = observations.tracks
-    unit_ix = np.array([units.index(name) for name in tracks.units], dtype=np.int64)[tracks.row_unit_ix]
     state = np.full(len(episode_ix), NO_UNIT)
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         rows = rows[episode_ix[rows] >= 0]
         state[rows] = judge_sight(str(unit.pem), experiment, observations.view.take(rows), tags)
     rows = np.flatnonzero(episode_ix >= 0)
-    return _keep_changes(SightChanges(unit_ix[rows], episode_ix[rows], tracks.row_captured_s[rows], state[rows]))
+    return _keep_changes(
+        SightChanges(tracks.row_unit_ix[rows], episode_ix[rows], tracks.row_captured_s[rows], state[rows])
+    )
 
 
 def _keep_changes(lists: SightChanges) -> SightChanges:

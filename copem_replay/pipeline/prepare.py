@@ -281,7 +281,9 @@ class Replay:
                 looks.append((self._observe_with(viewing, chunk), viewing))
             for seen, by in looks:
                 numbers = self.episodes.number_rows(seen.tracks)
-                changes.append(find_sight_changes(seen, by, self.scene.tags, numbers, units))
+                found = find_sight_changes(seen, by, self.scene.tags, numbers)
+                unit_ix = np.array([units.index(name) for name in seen.tracks.units], dtype=np.int64)[found.unit_ix]
+                changes.append(found._replace(unit_ix=unit_ix))
             met.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
         return join_sight_changes(changes, self.episodes.onset_s), np.any(met, axis=0), rows

@@ -154,8 +154,7 @@ def test_what_nothing_reads_is_not_computed_and_nothing_else_changes() -> None:
     every = observe_objects(replay.scene, replay.truth, replay.expanded, replay.placed)
     for name in ("couple_ix", "probability", "existence"):
         assert np.array_equal(getattr(found, name), getattr(every, name)), name
-    numbers = replay.episodes.number_rows(every.tracks)
-    changes = [find_sight_changes(every, replay.expanded, replay.scene.tags, numbers, [*replay.expanded.modelled])]
+    changes = [find_sight_changes(every, replay.expanded, replay.scene.tags, replay.episodes.number_rows(every.tracks))]
     spans = join_sight_changes(changes, replay.episodes.onset_s)
     for name in SightSpans.__dataclass_fields__:
         assert np.array_equal(getattr(replay.sight_spans, name), getattr(spans, name)), name
