@@ -15,7 +15,7 @@ that holds for the object and the units of the configuration:
 | lost | a unit's newest list holds it, and never arrives |
 | under way | a list that holds it is on its way, or waits for the next fused list |
 | unmatched | a unit's newest list that arrived holds it, but no entry of the fused list is matched with it |
-| listed before the onset | before the onset: the receiver's newest list holds it |
+| listed before it counts | before the onset: the receiver's newest list holds it |
 | listed, not confirmed | the newest list counts, but `confirm` asks for more lists |
 | listed too late | the newest list became available after the episode's end |
 | known | the newest list holds it, at or after `detection_s` |
@@ -42,7 +42,7 @@ from copem_replay.pipeline.sight import ABSENT, Sight, SpanNames, StatusSpan, li
 
 STATUSES = (
     "absent", "not listed", "out of range or view", "hidden", "in sight", "not sent", "list lost", "on its way",
-    "unmatched", "listed before the onset", "listed, not confirmed", "listed too late", "known",
+    "unmatched", "listed before it counts", "listed, not confirmed", "listed too late", "known",
 )  # fmt: skip
 UNLISTED = NO_UNIT
 NOT_SENT, LOST, UNDER_WAY, UNMATCHED, EARLY, UNCONFIRMED, TOO_LATE, KNOWN = range(IN_SIGHT + 1, len(STATUSES))

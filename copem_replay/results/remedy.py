@@ -43,11 +43,7 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
     if not pairs:
         return ""
     _, best_s, last, best, change = min(pairs, key=itemgetter(0, 1))
-    gain = (
-        f"{last_s - best_s:.2f} s earlier"
-        if np.isfinite(last_s)
-        else f"{best_s:.2f} s after the onset instead of never"
-    )
+    gain = f"{last_s - best_s:.2f} s earlier" if np.isfinite(last_s) else f"after {best_s:.2f} s instead of never"
     return f"What would help {last}: {change} ({best}): known {gain}."
 
 

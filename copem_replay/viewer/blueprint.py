@@ -329,7 +329,7 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
     chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
     titles = {
-        name: f"{name}: known {show_seconds(s)} s after the onset" if np.isfinite(s) else f"{name}: never known"
+        name: f"{name}: known after {show_seconds(s)} s" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
     }
     return [(name, titles[name]) for name in chosen]
@@ -484,7 +484,7 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
     return rrb.StateTimelineView(
         origin=make_entity_path(*object_lanes_path(scene, object_ix)),
         contents=["+ $origin/**", *(f"+ {path}" for path in under)] if under else "$origin/**",
-        name=f"{content.id_of(object_ix)}, onset {onset_s:.1f} s",
+        name=f"{content.id_of(object_ix)}, from {onset_s:.1f} s",
         time_view=make_time_axis(*content.lanes_axis_s(object_ix)),
     )
 

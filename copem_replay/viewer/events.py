@@ -46,7 +46,7 @@ def write_onset_texts(out: RecordingSink, scene: Scene, table: pd.DataFrame) -> 
     import rerun as rr
 
     episodes = table.drop_duplicates("object_id").sort_values("onset_s", kind="stable")
-    text = [f"onset of {_name_object(episode, scene)}{_BEGAN[episode.began]}" for episode in table_rows(episodes)]
+    text = [f"counts: {_name_object(episode, scene)}{_BEGAN[episode.began]}" for episode in table_rows(episodes)]
     out.columns(
         ["events", "onsets"],
         to_nanoseconds(episodes["onset_s"]),
@@ -137,16 +137,16 @@ def _describe_ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
     suffix = f"; the ego {verdict}" if verdict else ""
     if not episode.detected:
         why = EndReason(episode.ended_by)
-        ending = f"undetected when {why.past}" if why.censors else "left undetected"
+        ending = f"not known when {why.past}" if why.censors else "never known"
         return episode.ended_s, "WARN", f"{name} {ending}{suffix}"
     late_s, far_m = episode.time_to_detection_s, episode.distance_at_detection_m
-    when = f"{abs(late_s):.2f} s {'before' if late_s < 0 else 'after'} the onset"
+    when = f"{-late_s:.2f} s before it counts" if late_s < 0 else f"after {late_s:.2f} s"
     where = "" if np.isnan(far_m) else f", at {far_m:.1f} m"
     passed = verdict is None or episode.braking_pass
     return (
         episode.detection_s,
         "INFO" if passed else "WARN",
-        f"{name} detected by {episode.first_unit} {when}{where}{suffix}",
+        f"{name} known {when} by {episode.first_unit}{where}{suffix}",
     )
 
 
@@ -184,7 +184,7 @@ def write_difference_text(
         first = [tables[0], *([f"**{name}** · {helps[0]}"] if helps[0] else [])]
     ids = [short_ids(replay.scene)[replay.scene.object_number[name]] for name in too_short]
     among = "; what is shown here is among them" if {replay.scene.object_ids[k] for k in shown} & {*too_short} else ""
-    said = "Too short to judge, seen for less than 2 s before or after the onset"
+    said = "Too short to judge, seen for less than 2 s before or after it counts"
     short = [f"{said}: {_escape_cell(', '.join(ids))}{among}."] if ids else []
     others = [_escape_cell(line) for line in _describe_others(counted, replay.scene, shown)]
     for path, parts in ((DIFFERENCE_TEXT, tables), (DIFFERENCE_SHORT, first)):
@@ -222,7 +222,7 @@ def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:
         ]
         unit = episode.first_unit if episode.detected else "–"
         lines.append(f"| {_escape_cell(episode.configuration)} | {' | '.join(cells)} | {_escape_cell(unit)} |")
-    return f"**{_name_object(first, scene)}**, known after its onset at {first.onset_s:.2f} s\n\n" + "\n".join(lines)
+    return f"**{_name_object(first, scene)}**, counts from {first.onset_s:.2f} s on\n\n" + "\n".join(lines)
 
 
 def _tell_outcome(episode: Any) -> str:
@@ -285,8 +285,8 @@ LEGEND = """A configuration has one colour in every file and figure of its exper
 - an arrow at the edge of a view, `61 → 44 m`: object 61 is farther that way, 44 m from the ego
 - white points: units; pale ground with an outline: their fields of view
 - lanes: in full colour *known*, from the time of detection in the table on; darker *listed, not known*,
-  since the list does not count: it is from before the onset, not confirmed, or too late; grey and brown: why not; the
-  white mark ends at the onset
+  since the list does not count: it is from before the object counts, not confirmed, or too late; grey and brown: why
+  not; the white mark ends where the object begins to count
 - compared with a baseline: a large white dot, only the baseline holds it; a small one, the baseline does not"""
 LINKS = """
 - lanes `lists/…` under those of an object: a unit that sends by a link; from the capture of a list to that of the next,

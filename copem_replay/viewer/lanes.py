@@ -49,7 +49,7 @@ FLAG = 6
 """Length of words such as “0.60 s”, as a multiple of the mark's."""
 NAME: Rgb = (58, 60, 66)
 """Ground of the configuration's name, where a lane begins: no colour of a status."""
-ONSET_IS = ("onset", "onset of the object")
+ONSET_IS = ("from here", "from here it counts")
 """The two halves of the mark."""
 WIDTH_POINTS, LETTER_POINTS, PADDING_POINTS = 380.0, 7.0, 10.0
 """Width of the narrowest lanes in a window of 1280 × 720, of a letter (rounded up), and of what is beside words."""

@@ -70,7 +70,9 @@ def name_part(words: str) -> tuple[str, str]:
 
 def read_lane(path: Path, who: str, number: int, onset_s: float, until_s: float) -> list[Part]:
     """The parts of a lane between two instants."""
-    said = [(when, words) for when, words in lane(path, who, number) if words not in ("onset", "onset of the object")]
+    said = [
+        (when, words) for when, words in lane(path, who, number) if words not in ("from here", "from here it counts")
+    ]
     ends = [when for when, _ in said[1:]] + [np.inf]
     parts = []
     for (begin_s, words), end_s in zip(said, ends, strict=True):

@@ -37,7 +37,7 @@ def helps(known_s: dict[str, float | None]) -> str:
         ({"all": 0.2, "late": 1.7}, "late: without the 1.5 s of latency (all): known 1.50 s earlier"),
         (
             {"two": 0.2, "one": None},
-            "one: the lists of m2 as well (two): known 0.20 s after the onset instead of never",
+            "one: the lists of m2 as well (two): known after 0.20 s instead of never",
         ),
         ({"two": 0.9, "all": 0.0}, "two: the lists of m3, m4 as well (all): known 0.90 s earlier"),
         ({"one": 0.1, "two": 0.4}, "two: the lists of m1 instead (one): known 0.30 s earlier"),
@@ -47,7 +47,7 @@ def helps(known_s: dict[str, float | None]) -> str:
         ({"two": 0.1, "all": 0.0, "one": 3.0}, "one: the lists of m2, m3, m4 as well (all): known 3.00 s earlier"),
         (
             {"other": None, "one": None, "two": 1.0},
-            "one: the lists of m2 as well (two): known 1.00 s after the onset instead of never",
+            "one: the lists of m2 as well (two): known after 1.00 s instead of never",
         ),
         # With more units more keys may differ; fewer come first.
         (
@@ -57,7 +57,7 @@ def helps(known_s: dict[str, float | None]) -> str:
         (
             {"other": None, "air": 0.5},
             "other: the lists of m1, m2 as well (and another link and latency and fusion) (air): known "
-            "0.50 s after the onset instead of never",
+            "after 0.50 s instead of never",
         ),
         ({"one": 3.0, "gnn": 0.0, "two": 1.0}, "one: the lists of m2 as well (two): known 2.00 s earlier"),
     ],

@@ -232,7 +232,7 @@ def test_the_table_has_signs_and_intervals(tmp_path):
 def test_what_the_table_shows_is_said_below(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
     assert lines == [
-        "differences to ideal, paired by log, object and run; accuracy of what is held at each frame",
+        "differences to ideal, paired by log, object and run; accuracy is of the newest list at each frame",
         "baseline ideal: by its name; --baseline names another",
         "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
         "drives",

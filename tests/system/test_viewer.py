@@ -24,7 +24,7 @@ VIEWS = {
     "PEM · whole run: 1 of 2 known",
     "pole · whole run: 2 of 2 known",
     "none · whole run: 0 of 2 known",
-    "7 car, onset 2.0 s",
+    "7 car, from 2.0 s",
     "What difference it made",
 }
 

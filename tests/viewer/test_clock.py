@@ -196,7 +196,7 @@ def test_so_do_all_views(measure: str, tmp_path: Path) -> None:
         onset_s = table[table["object_id"] == who]["onset_s"].iloc[0]
         for c in range(len(beside)):
             told_at = lane(path, f"{who} pedestrian", c)
-            ends = [b[0] for a, b in pairwise(told_at) if a[1] == "onset of the object"]
+            ends = [b[0] for a, b in pairwise(told_at) if a[1] == "from here it counts"]
             assert ends == ([pytest.approx(onset_s, abs=1e-9)] if onset_s > 0.1 else [])
 
 
@@ -212,9 +212,9 @@ def test_what_was_captured_before_the_onset_is_not_known(tmp_path: Path) -> None
     write_rrd(path, replay, wanted, [tracks_of_run(replay, wanted, 0)], table, SUMMARY, 0)
     assert lane(path, "2 pedestrian", 0) == [
         (0, "on its way from ego"),
-        (0.5, "listed before the onset"),
-        (pytest.approx(0.95, abs=0.05), "onset"),
-        (pytest.approx(0.975, abs=0.025), "onset of the object"),
+        (0.5, "listed before it counts"),
+        (pytest.approx(0.95, abs=0.05), "from here"),
+        (pytest.approx(0.975, abs=0.025), "from here it counts"),
         (1, "on its way from ego"),
         (1.5, "known"),
     ]

@@ -195,7 +195,7 @@ def test_what_is_too_short_is_listed(tmp_path: Path) -> None:
     made = make(tmp_path / "x.rrd", scene, measure={"onset": {"kind": "appears"}})
     [text] = static(made.path, "/difference")["TextDocument:text"]
     assert (
-        "Shown: 1 of 2 that count.\n\nToo short to judge, seen for less than 2 s before or after the onset: 8." in text
+        "Shown: 1 of 2 that count.\n\nToo short to judge, seen for less than 2 s before or after it counts: 8." in text
     )
     assert "7 car" in text
     assert "8 car" not in text
@@ -218,6 +218,6 @@ def test_what_is_shown_all_the_same_is_said_to_be_too_short(tmp_path: Path) -> N
     [text] = static(made.path, "/difference")["TextDocument:text"]
     assert "8 car" in text
     assert (
-        "Too short to judge, seen for less than 2 s before or after the onset: 8; what is shown here is among them."
+        "Too short to judge, seen for less than 2 s before or after it counts: 8; what is shown here is among them."
         in text
     )

@@ -450,10 +450,10 @@ def test_events_in_words(made: Made, alone: Made) -> None:
         return [(row[ELAPSED] * 1e-9, row["TextLog:level"][0], row["TextLog:text"][0]) for row in found]
 
     found = rows(made.path, "/events/onsets")
-    assert [(row[ELAPSED] * 1e-9, row["TextLog:text"][0]) for row in found] == [(2.0, "onset of 7 car")]
+    assert [(row[ELAPSED] * 1e-9, row["TextLog:text"][0]) for row in found] == [(2.0, "counts: 7 car")]
     assert told("GT") == [], "the truth knows at once, which is the onset"
-    assert told("PEM") == [(4.0, "INFO", "PEM: 7 car detected by ego 2.00 s after the onset, at 60.0 m")]
-    assert told("none") == [(4.0, "WARN", "none: 7 car left undetected")], "9 is too short to judge"
+    assert told("PEM") == [(4.0, "INFO", "PEM: 7 car known after 2.00 s by ego, at 60.0 m")]
+    assert told("none") == [(4.0, "WARN", "none: 7 car never known")], "9 is too short to judge"
 
 
 def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
@@ -465,10 +465,10 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
     made.write(tmp_path / "x.rrd", table=verdicts)
     path = tmp_path / "x.rrd"
     [end] = rows(path, "/events/PEM")
-    text = "PEM: 7 car detected by ego 2.00 s after the onset, at 60.0 m; the ego does not stay clear"
+    text = "PEM: 7 car known after 2.00 s by ego, at 60.0 m; the ego does not stay clear"
     assert (end["TextLog:level"], end["TextLog:text"]) == (["WARN"], [text])
     assert static(path, "/difference")["TextDocument:text"][0].splitlines() == [
-        "**7 car**, known after its onset at 2.00 s",
+        "**7 car**, counts from 2.00 s on",
         "",
         "| configuration | after | at | the ego | by |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -476,7 +476,7 @@ def test_what_becomes_of_a_conflict_is_told(made: Made, tmp_path: Path) -> None:
         "| pole | 0.00 s | 80.0 m | **too near**, 0.2 m | pole |",
         "| none | never | – | **hits** at 10.0 m/s | – |",
         "",
-        "What would help none: the lists of pole instead (pole): known 0.00 s after the onset instead of never.",
+        "What would help none: the lists of pole instead (pole): known after 0.00 s instead of never.",
     ]
     both = (static(path, entity)["TextDocument:text"] for entity in ("/difference_short", "/difference"))
     assert next(both) == next(both), "one object is all of it"
@@ -504,7 +504,7 @@ def test_detected_before_the_onset_and_where_nobody_knows(made: Made, tmp_path: 
     )  # fmt: skip
     made.write(tmp_path / "x.rrd", table=table)
     found = rows(tmp_path / "x.rrd", "/events/PEM")
-    assert [row["TextLog:text"] for row in found] == [["PEM: 7 car detected by ego 0.50 s before the onset"]]
+    assert [row["TextLog:text"] for row in found] == [["PEM: 7 car known 0.50 s before it counts by ego"]]
 
 
 def test_the_summary_says_which_run_and_lists_configurations_side_by_side(made: Made) -> None:
@@ -550,10 +550,10 @@ def test_a_blueprint_inside_and_one_name_per_layout(made: Made, tmp_path: Path) 
     assert set(names) >= {
         "PEM · whole run: 1 of 2 known", "pole · whole run: 2 of 2 known",
         "none · whole run: 0 of 2 known",
-        "7 car, onset 2.0 s", "What difference it made",
+        "7 car, from 2.0 s", "What difference it made",
         "7 car: position error, m", "GOSPA of all measured objects, m", "Measured objects known (grey: there are)",
         "Events", "Legend",
-        "Summary of all runs", "pole: known 0.00 s after the onset",
+        "Summary of all runs", "pole: known after 0.00 s",
         "Solid: pole · outlines: PEM · grey: the truth",
     }  # fmt: skip
     pages = [

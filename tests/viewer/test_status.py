@@ -135,7 +135,7 @@ def test_lanes_tell_when_a_configuration_knew(hiding: Made) -> None:
     boxes = [at(hiding.path, f"/world/{name}/boxes", 1.2)["Boxes3D:colors"][0] >> 8 for name in ("PEM", "both")]
     assert known == boxes
     # One half of the mark stands out from the ground of any theme.
-    halves = {(colour_of(name)["onset"] >> 8, colour_of(name)["onset of the object"] >> 8) for name in names}
+    halves = {(colour_of(name)["from here"] >> 8, colour_of(name)["from here it counts"] >> 8) for name in names}
     assert halves == {(0xFFFFFF, 0)}
 
 

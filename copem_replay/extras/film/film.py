@@ -277,7 +277,7 @@ def _choose_words(
     after_s = (known_ns - onset_ns) * 1e-9 if NEVER_NS not in (known_ns, onset_ns) else 0.0
     told = {
         ABSENT: "absent",
-        KNOWN: f"known {after_s:.2f} s after the onset" if after_s > 0 else "known at once",
+        KNOWN: f"known after {after_s:.2f} s" if after_s > 0 else "known at once",
     }
     name = short_ids(scene)[object_ix]
     labels = reasons.labels.to_pylist()
@@ -328,7 +328,7 @@ def _draw_frames(figure: Figure, plot: _Plot) -> Iterator[None]:
     scene = plot.replayed.replay.scene
     about = f"{CLASSES[int(scene.object_class[plot.object_ix])]} {short_ids(scene)[plot.object_ix]}"
     for frame, time_s in enumerate((plot.time_s - plot.onset_s).tolist()):
-        when = f"{time_s:.1f} s after the onset" if time_s > -1e-6 else f"{-time_s:.1f} s before the onset"
+        when = f"{time_s:.1f} s after it counts" if time_s > -1e-6 else f"{-time_s:.1f} s before it counts"
         title.set_text(f"{about}, {when.replace('-0.0', '0.0')}")
         for panel in panels:
             panel.show(frame)
@@ -413,7 +413,7 @@ class _KnownBars:
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_yticks(range(len(names)), [name if len(name) <= 20 else f"{name[:19]}…" for name in names], fontsize=8)
         axes.tick_params(labelsize=8, length=0, colors=_INK)
-        axes.set_xlabel("seconds since the onset", fontsize=8, labelpad=1, color=_INK)
+        axes.set_xlabel("seconds since it counts", fontsize=8, labelpad=1, color=_INK)
         for side in ("top", "right", "left"):
             axes.spines[side].set_visible(False)
         axes.axvline(0.0, color=_INK, linewidth=1.0, linestyle=(0, (2, 2)))

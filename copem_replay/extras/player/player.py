@@ -309,7 +309,7 @@ _KEYS = (
 )
 _SIGNS = (
     ("known", "filled: known"),
-    ("listed", "outline: listed, not yet known, from a list captured before the onset, or not measured"),
+    ("listed", "outline: listed, not yet known, from a list captured before it counts, or not measured"),
     ("false", "dashed with ✕: about nobody"),
     ("truth", "grey: where it really is"),
     ("ego", "grey, filled: the ego"),

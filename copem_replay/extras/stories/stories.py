@@ -40,7 +40,7 @@ def story_parts(study: ReportData) -> list[Html]:
     run = study.results.provenance.run_shown.get(log, 0)
     table, rows = _rows_of_run(study, log, run)
     if not (rows["unknown_s"] > SAME_INSTANT_S).any():
-        return [make_tag("p", f"Every configuration knows every object of {log} at its onset (run {run}).")]
+        return [make_tag("p", f"Every configuration knows every object of {log} at once (run {run}).")]
     try:
         drive = read_drive(study.results, log)
     except RecordingError:
@@ -53,7 +53,7 @@ def story_parts(study: ReportData) -> list[Html]:
         "the most different times, near the way of the ego."
     )
     named = ", ".join(too_short[:_NAMED]) + (", …" if len(too_short) > _NAMED else "")
-    short = f" Too short to judge, seen for less than 2 s before or after the onset: {named}" if too_short else ""
+    short = f" Too short to judge, seen for less than 2 s before or after it counts: {named}" if too_short else ""
     short += "." if short and not short.endswith("…") else ""
     parts = [make_tag("p", said + short)]
     if told and not any(spans.values()):

@@ -161,7 +161,7 @@ def _draw_apart(
         axes.set_axis_off()
     for axes in panels[max(len(others) - _COLUMNS, 0) : len(others)]:
         axes.tick_params(labelbottom=True)
-        axes.set_xlabel("Time since the onset (s)")
+        axes.set_xlabel("Time since the object counts (s)")
     for axes in panels[::_COLUMNS]:
         axes.set_ylabel("Not yet known")
     drawn = [line for line in panels[0].get_lines() if line.get_label() == baseline]
@@ -200,7 +200,7 @@ def _draw_together(
     for (name, curve), place in zip(curves.items(), places, strict=True):
         with mark_configuration(numbers[name], axes):
             _draw_label(axes, short[name], looks[name], (end_s, 1 - _evaluate_share(curve, end_s)), place)
-    axes.set_xlabel("Time since the onset (s)")
+    axes.set_xlabel("Time since the object counts (s)")
     axes.set_ylabel("Share not yet known")
     return figure
 

@@ -246,7 +246,7 @@ def _note_sentences(
     north = ", north is up" if drive.scene.frame is not None and not drive.scene.frame.yaw_rad else ""
     return [
         f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}{north}",
-        "Grey: before the onset; thick: unknown since the onset; thin: afterwards, in the colour of the time that it "
+        "Grey: before it counts; thick: unknown from then on; thin: afterwards, in the colour of the time that it "
         f"took; darker is later{never}",
         *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),
         *(["Triangles: fixed units"] if drive.fixed_units() else []),

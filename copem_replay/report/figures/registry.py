@@ -114,9 +114,9 @@ FIGURES: dict[str, FigureKind] = {
         lambda results, of: curves_figure(results, configurations=of.configurations),
         about=lambda results: (
             "A curve gives the share of all rows (measured objects × runs × logs) that are not yet known this long "
-            "after the onset, the lower the better: 100 % less the cumulative incidence of detection (Aalen–Johansen, "
-            "departure competing). Objects that leave the scene undetected keep the curve above 0. Where lines "
-            "coincide, the thinner ones are on top.",
+            "after they begin to count, the lower the better: 100 % less the cumulative incidence of detection "
+            "(Aalen–Johansen, departure competing). Objects that leave the scene undetected keep the curve above 0. "
+            "Where lines coincide, the thinner ones are on top.",
         ),
     ),
     "late_paths": FigureKind(

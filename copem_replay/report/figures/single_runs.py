@@ -344,7 +344,7 @@ def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) ->
         draw_labels(column[0], story.events, steps, _HEIGHT_IN)
         title = f"{names[story.configuration]}\n{story.result}"
         column[0].set_title(title, pad=(steps * STEP_IN + 0.08) * 72, loc="left", linespacing=1.4)
-        column[2].set_xlabel("Time since the onset (s)")
+        column[2].set_xlabel("Time since the object counts (s)")
     for axes, label in zip(panels[:, 0], _LABELS, strict=True):
         axes.set_ylabel(label)
     panels[0, 0].set_xlim(begin_s, end_s)
@@ -390,7 +390,7 @@ def _draw_together(results: Results, replay: Replay, stories: Sequence[Story]) -
     column[0].set_title(title, pad=(len(events) * STEP_IN + 0.08) * 72, loc="left")
     for axes, label in zip(column, _LABELS, strict=True):
         axes.set_ylabel(label)
-    column[2].set_xlabel("Time since the onset (s)")
+    column[2].set_xlabel("Time since the object counts (s)")
     column[2].set_ylim(-0.05, 1.05)
     column[0].set_xlim(begin_s, end_s)
     return figure
@@ -462,14 +462,14 @@ def _note_sentences(results: Results, choice: Choice, stories: Sequence[Story]) 
     kind = results.tally.loc[results.tally["object_id"] == choice.object_id, "object_class"].iloc[0]
     thin = ""
     if braking is not None and any(story.encounter is not None for story in stories):
-        course = "as recorded" if braking.ego == "recorded" else "with constant speed from the onset"
+        course = "as recorded" if braking.ego == "recorded" else "with constant speed from then on"
         thin = (
             f"Thick: the ego brakes as its declared driver does; thin: it does not brake, {course}; dashed: the margin "
             f"of {braking.margin_m:g} m. The visible share is that of an ego that does not brake: pale from braking on"
         )
     return [
-        f"{results.name}: {kind} {choice.object_id} in log {choice.log}, run {choice.run}, seed {experiment.seed}; the "
-        f"onset is {stories[0].onset_s:.2f} s after the log's start",
+        f"{results.name}: {kind} {choice.object_id} in log {choice.log}, run {choice.run}, seed {experiment.seed}; it "
+        f"counts from {stories[0].onset_s:.2f} s after the log's start on",
         describe_list_rates(results.summary, choice.configurations),
         thin,
         describe_left_out(results.chosen(None), choice.configurations) if not choice.named else "",

@@ -239,7 +239,7 @@ def _describe_others(experiment: Experiment, left: pd.DataFrame) -> str:
         return f" {len(left)} more {what}{'' if one else 's'} {was} {where} when the recording began; {them} not count."
     return (
         f" {len(left)} more {what}{'' if one else 's'} {'does' if one else 'do'} not count: what counts began "
-        f"{' or '.join(experiment.measure.began)}, and has a frame after its onset."
+        f"{' or '.join(experiment.measure.began)}, and is seen for more than one frame."
     )
 
 

@@ -113,7 +113,7 @@ def _object_table(rows: pd.DataFrame, names: list[str]) -> Html:
         ]
         cells += [make_tag("td", _when_known(found.get((*of, name)))) for name in names]
         lines.append(make_tag("tr", head, *cells))
-    return make_table(["object", "class", "onset, s", "range then, m", *names], lines)
+    return make_table(["object", "class", "counts from, s", "range then, m", *names], lines)
 
 
 def _when_known(found: tuple[float, float] | None) -> str:

@@ -271,7 +271,7 @@ def _held_table(study: ReportData, regret: Comparison) -> Html:
         make_tag("tr", row_head(study, name), *(make_tag("td", cell) for cell in rest), data_row=name)
         for name, *rest in cells.itertuples(index=False)
     ]
-    caption = f"What is held at the frames of the truth: of the configuration / of {regret.baseline}"
+    caption = f"The newest list at every frame of the truth: of the configuration / of {regret.baseline}"
     return make_table(list(cells.columns), lines, caption=caption, id_="regret-held") if lines else Html()
 
 

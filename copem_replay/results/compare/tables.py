@@ -165,7 +165,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Lines on the table: its meaning, and the configurations that are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
-    of_lists = "accuracy of what is held at each frame"
+    of_lists = "accuracy is of the newest list at each frame"
     yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
     if comparison.unchanged:
         yield f"unchanged: {', '.join(comparison.unchanged)}"
