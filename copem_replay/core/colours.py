@@ -43,11 +43,11 @@ def configuration_signs(
     and shape of the first are no other one's; the others take turns of seven colours and six shapes, so that 43
     differ. Nobody tells that many by their colour: names stand beside them.
     """
-    every = list(configurations)
+    names = list(configurations)
     palette = [_read_colour(digits) for digits in _PALETTES[theme].split()]
-    placed = [name for name in every if name not in truths] or every
+    placed = [name for name in names if name not in truths] or names
     signs = {name: Sign(palette[_take_turn(k, len(palette))], _take_turn(k, SHAPES)) for k, name in enumerate(placed)}
-    return {name: signs.get(name, Sign(TRUTH, 0)) for name in every}
+    return {name: signs.get(name, Sign(TRUTH, 0)) for name in names}
 
 
 def configuration_colours(

@@ -82,8 +82,8 @@ def avoid_device_name(name: str) -> str:
     return f"%{ord(name[0]):02X}{name[1:]}" if _DEVICES.fullmatch(name) else name
 
 
-def _encode(found: re.Match[str]) -> str:
-    return f"%{ord(found[0]):02X}"
+def _encode(match: re.Match[str]) -> str:
+    return f"%{ord(match[0]):02X}"
 
 
 def hidden_name(name: str) -> str:
@@ -106,23 +106,23 @@ def find_scratch_names(folder: Path) -> list[str]:
     return []
 
 
-def list_names(folder: Path, at: str = "") -> Iterator[str]:
-    """Files, links and empty folders in a folder, by names relative to it; `at` comes before them. Raises OSError.
+def list_names(folder: Path, prefix: str = "") -> Iterator[str]:
+    """Files, links and empty folders in a folder, by names relative to it; `prefix` comes before them. Raises OSError.
 
     Temporary files are left out: they are of commands that run now, or were killed.
     """
     entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    if at and not entries:
-        yield at.removesuffix("/")
+    if prefix and not entries:
+        yield prefix.removesuffix("/")
     for entry in entries:
         if _is_unfinished(entry):
             continue
         if not entry.is_dir(follow_symlinks=False):
-            yield at + entry.name
+            yield prefix + entry.name
         elif os.path.ismount(entry.path):
             raise OutputError(f"{entry.path}: a mount point cannot be replaced; choose another folder with --out")
         else:
-            yield from list_names(Path(entry.path), f"{at}{entry.name}/")
+            yield from list_names(Path(entry.path), f"{prefix}{entry.name}/")
 
 
 def _is_unfinished(entry: os.DirEntry[str]) -> bool:
@@ -290,40 +290,40 @@ def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[Scrat
 
 
 def replace_folder(
-    scratch: ScratchFolder, folder: Path, list_others: Callable[[Path], Collection[str]], seen: os.stat_result
+    scratch: ScratchFolder, folder: Path, list_others: Callable[[Path], Collection[str]], old_stat: os.stat_result
 ) -> list[str] | None:
     """Put the new folder in the place of `folder`, with the files of it that `list_others` names: the user's own.
 
     They are linked into the new folder before it has its name; those that cannot be, or come meanwhile, are moved after
     that. Between two renames there is no folder of the name: of a process that is killed there, `remove_leftovers` puts
     the old one back. Returns a line for each file that stays in the scratch folder; None: nothing is replaced, because
-    the folder is no longer the one `seen`. Raises OSError.
+    the folder is no longer the one `old_stat`. Raises OSError.
     """
     new, old, linked = scratch.new, scratch.old, list(list_others(folder))
     for name in linked:
         with suppress(OSError):
             _move_over(name, folder, new, lambda source, target: os.link(source, target, follow_symlinks=False))
-    new.chmod(stat.S_IMODE(seen.st_mode))
+    new.chmod(stat.S_IMODE(old_stat.st_mode))
     flush_all(new)
     os.rename(folder, old)
     try:
-        if same := os.path.samestat(old.stat(), seen):
+        if is_same := os.path.samestat(old.stat(), old_stat):
             os.rename(new, folder)
     except BaseException:
         os.rename(old, folder)
         raise
-    if not same:
+    if not is_same:
         os.rename(old, folder)
         return None
     flush_file(folder.parent)
-    stay = {}
+    staying = {}
     for name in list_others(old):
         try:
             _move_over(name, old, folder, os.rename)
         except OSError as error:
-            stay[name] = f"{name}: cannot be moved over ({error.strerror}); it is in {old}"
-    scratch.may_remove(set(list_names(old)).difference(stay))
-    return list(stay.values())
+            staying[name] = f"{name}: cannot be moved over ({error.strerror}); it is in {old}"
+    scratch.may_remove(set(list_names(old)).difference(staying))
+    return list(staying.values())
 
 
 def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], None]) -> None:
@@ -402,26 +402,26 @@ def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
     return notes
 
 
-def _remove_leftover(left: Path, path: Path) -> list[str]:
+def _remove_leftover(leftover: Path, path: Path) -> list[str]:
     """Remove a file or folder that may have been left; returns notes for the user. Raises OSError."""
     notes = []
-    with _hold_lock(left) as free:
+    with _hold_lock(leftover) as free:
         if not free:
             return []
-        if (left / "old").is_dir() and not os.path.lexists(path):
-            os.rename(left / "old", path)
+        if (leftover / "old").is_dir() and not os.path.lexists(path):
+            os.rename(leftover / "old", path)
             notes.append(f"{path}: put back, as a run was killed that was about to replace it")
-        if _clear(left, path):
-            return [*notes, f"{left}: removed, left by a process that was killed"]
-    return [*notes, f"{left}: left by a process that was killed, and not removed: it holds what is not ours"]
+        if _clear(leftover, path):
+            return [*notes, f"{leftover}: removed, left by a process that was killed"]
+    return [*notes, f"{leftover}: left by a process that was killed, and not removed: it holds what is not ours"]
 
 
 @contextmanager
-def _hold_lock(left: Path) -> Iterator[bool]:
+def _hold_lock(leftover: Path) -> Iterator[bool]:
     """Hold the lock of a temporary file or scratch folder, if it is free. A folder that has none yet is free."""
-    is_folder = left.is_dir() and not left.is_symlink()
+    is_folder = leftover.is_dir() and not leftover.is_symlink()
     try:
-        fd = os.open(left / MANIFEST if is_folder else left, os.O_RDWR | NO_LINK)
+        fd = os.open(leftover / MANIFEST if is_folder else leftover, os.O_RDWR | NO_LINK)
     except FileNotFoundError:
         yield True
         return
@@ -435,30 +435,30 @@ def _hold_lock(left: Path) -> Iterator[bool]:
             os.close(fd)
 
 
-def _clear(left: Path, path: Path) -> bool:
+def _clear(leftover: Path, path: Path) -> bool:
     """Remove a temporary file; of a scratch folder what its list names, links to files in `path`, and what killed
     processes left in it. True where nothing is left. Raises OSError.
     """
-    if left.is_file():
-        left.unlink()
+    if leftover.is_file():
+        leftover.unlink()
         return True
-    if not os.path.lexists(left / MANIFEST):  # killed before it had a list, or about to get one
+    if not os.path.lexists(leftover / MANIFEST):  # killed before it had a list, or about to get one
         with suppress(OSError):
-            left.rmdir()
-        return not left.exists()
-    listed = _read_scratch_list(left)
-    for place, folders, files in os.walk(left, topdown=False):
-        for each in (Path(place, name) for name in (*files, *folders)):
-            inside = "/".join(each.relative_to(left).parts[1:])
-            if each.is_dir() and not each.is_symlink():
+            leftover.rmdir()
+        return not leftover.exists()
+    listed = _read_scratch_list(leftover)
+    for place, folders, files in os.walk(leftover, topdown=False):
+        for item in (Path(place, name) for name in (*files, *folders)):
+            relative = "/".join(item.relative_to(leftover).parts[1:])
+            if item.is_dir() and not item.is_symlink():
                 with suppress(OSError):
-                    _remove_leftover(each, path) if os.path.lexists(each / MANIFEST) else each.rmdir()
-            elif inside and (inside in listed or is_temporary(each.name) or _are_links(each, path / inside)):
-                each.unlink()
-    if os.listdir(left) == [MANIFEST]:
-        (left / MANIFEST).unlink()
-        left.rmdir()
-    return not left.exists()
+                    _remove_leftover(item, path) if os.path.lexists(item / MANIFEST) else item.rmdir()
+            elif relative and (relative in listed or is_temporary(item.name) or _are_links(item, path / relative)):
+                item.unlink()
+    if os.listdir(leftover) == [MANIFEST]:
+        (leftover / MANIFEST).unlink()
+        leftover.rmdir()
+    return not leftover.exists()
 
 
 def _read_scratch_list(scratch: Path) -> set[str]:

@@ -176,15 +176,15 @@ def _check_words(text: str) -> tuple[str, list[str]]:
 def _check_crs(text: str) -> None:
     """Raises InputError where a projection does not give metres east and north."""
     crs = _crs(text)
-    what = ""
+    fault = ""
     if crs.is_geographic or crs.is_geocentric or not crs.is_projected:
-        what = f"{'degrees' if crs.is_geographic else 'no projection'} ({crs.name})"
+        fault = f"{'degrees' if crs.is_geographic else 'no projection'} ({crs.name})"
     elif odd := [axis for axis in crs.axis_info if axis.unit_conversion_factor != 1.0]:
-        what = f"{odd[0].unit_name} ({crs.name})"
+        fault = f"{odd[0].unit_name} ({crs.name})"
     elif odd := [axis for axis in crs.axis_info if axis.direction.lower() not in ("east", "north", "up")]:
-        what = f"an axis to the {odd[0].direction} ({crs.name})"
-    if what:
-        raise InputError(f"{text!r}: expected a projection to metres east and north, found {what}")
+        fault = f"an axis to the {odd[0].direction} ({crs.name})"
+    if fault:
+        raise InputError(f"{text!r}: expected a projection to metres east and north, found {fault}")
 
 
 def check_scale(frame: Frame, middle_m: Places) -> Iterator[str]:
@@ -258,26 +258,26 @@ def read_mgrs(square: str) -> tuple[str, tuple[float, float]]:
 
     Raises InputError where there is no such square. Source: NGA.STND.0037, appendix B.
     """
-    found = re.fullmatch(r"(\d{1,2})([C-HJ-NP-X])([A-HJ-NP-Z])([A-HJ-NP-V])", square.upper())
-    if found is None or not 1 <= int(found[1]) <= 60:
+    match = re.fullmatch(r"(\d{1,2})([C-HJ-NP-X])([A-HJ-NP-Z])([A-HJ-NP-V])", square.upper())
+    if match is None or not 1 <= int(match[1]) <= 60:
         raise InputError(f"expected a square of MGRS such as 54SUE, found {square!r}")
-    zone, band = int(found[1]), _BANDS.index(found[2])
-    column = _COLUMNS[(zone - 1) % 3].find(found[3])
+    zone, band = int(match[1]), _BANDS.index(match[2])
+    column = _COLUMNS[(zone - 1) % 3].find(match[3])
     if column < 0:
         raise InputError(
             f"expected a square of MGRS, found {square!r}: zone {zone} has columns {_COLUMNS[(zone - 1) % 3]}"
         )
-    row_m = (_ROWS.index(found[4]) - (0 if zone % 2 else 5)) % 20 * _SQUARE_M
+    row_m = (_ROWS.index(match[4]) - (0 if zone % 2 else 5)) % 20 * _SQUARE_M
     south_deg = -80 + 8 * band
     proj = f"+proj=utm +zone={zone}{' +south' * (south_deg < 0)} +datum=WGS84 +units=m"
-    north_deg = min(south_deg + (12 if found[2] == "X" else 8), 84)
+    north_deg = min(south_deg + (12 if match[2] == "X" else 8), 84)
     meridian = 6 * zone - 183
     low_m, high_m = (Frame(proj).from_wgs84([lat, meridian])[0, 1] for lat in (south_deg, north_deg))
     rows = [row_m + k * 2_000_000.0 for k in range(6)]
     north_m = next((at_m for at_m in rows if low_m - 1.5 * _SQUARE_M < at_m < high_m + _SQUARE_M / 2), None)
     if north_m is None:
         raise InputError(
-            f"expected a square of MGRS, found {square!r}: band {found[2]} has no row {found[4]} in that zone"
+            f"expected a square of MGRS, found {square!r}: band {match[2]} has no row {match[4]} in that zone"
         )
     return proj, ((column + 1) * _SQUARE_M, north_m)
 

@@ -141,15 +141,15 @@ class FusedTracks:
 
         The id of the object a row is about, else the fusion's own identity for it, else its place in its list.
         """
-        which = self.fused.row_object_ix.copy()
-        unknown = np.flatnonzero(which < 0)
+        name_ix = self.fused.row_object_ix.copy()
+        unknown = np.flatnonzero(name_ix < 0)
         track_id = np.full(len(unknown), -1) if self.said is None else self.said["track_id"][unknown]
         tracks, track = np.unique(track_id[track_id >= 0], return_inverse=True)
-        which[unknown] = len(scene.object_ids) + len(tracks) + self._place[unknown]
-        which[unknown[track_id >= 0]] = len(scene.object_ids) + track
+        name_ix[unknown] = len(scene.object_ids) + len(tracks) + self._place[unknown]
+        name_ix[unknown[track_id >= 0]] = len(scene.object_ids) + track
         longest = int(np.diff(self.fused.by_frame[1]).max(initial=0))
         names = (*scene.object_ids, *(f"track:{t}" for t in tracks), *(f"entry:{k}" for k in range(longest)))
-        return list(names), which
+        return list(names), name_ix
 
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true one, or what the fusion takes it for."""

@@ -67,11 +67,11 @@ class Births:
     gone_ns: Int
 
 
-def drop_unshared(random_key: RandomKey, of: Of) -> RandomKey:
+def drop_unshared(random_key: RandomKey, shared_by: Of) -> RandomKey:
     """The address (P,) of a number that more than one unit and object have in common: without what may differ."""
-    if of in ("object", "all"):
+    if shared_by in ("object", "all"):
         random_key = replace(random_key, units=("",), unit_ix=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
-    if of in ("unit", "all"):
+    if shared_by in ("unit", "all"):
         of_all = np.full(len(random_key.stamp_ns), stable_hash("everyone"), dtype=np.uint64)
         random_key = replace(random_key, object_word=of_all)
     return random_key
@@ -462,7 +462,7 @@ def fill_correlated_rows(
     """
     top, leaf = levels
     shared, fresh = weights
-    frame, first, list_ns, from_before, from_right, own = lists
+    frame, first, list_ns, from_before, from_right, from_noise = lists
     chained = len(frame) > 0
     everywhere = where.shape[0] == 1 and where.shape[1] == 1
     # Values at the ends of the interval of each level, 2^(leaf + i) long, around the row before.
@@ -514,8 +514,8 @@ def fill_correlated_rows(
                 last_list, value = first[f] - 1, left[0]
             for g in range(last_list + 1, f + 1):
                 value = from_before[g] * value + from_right[g] * right[0]
-                if own[g] > 0:
-                    value += own[g] * _draw_standard_normal(k, w, list_ns[g], run)
+                if from_noise[g] > 0:
+                    value += from_noise[g] * _draw_standard_normal(k, w, list_ns[g], run)
             last_list = f
             out[s, p] = value
 

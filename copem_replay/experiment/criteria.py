@@ -166,19 +166,19 @@ def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int], 
 
     `counted`: by log how many episodes count.
     """
-    asked = [name for name, one in criteria.items() if not one.of_runs]
+    names = [name for name, one in criteria.items() if not one.of_runs]
     logs = sum(number > 0 for number in counted)
     over = choose_over(logs, sum(counted), 1)
     if over in TRAFFIC:
-        for name in asked:
+        for name in names:
             once = over == "logs" and (criteria[name].weigh or measure.weigh) == DRIVES
             clusters = logs if over == "logs" else sum(counted)
             known = Known(over, clusters, clusters if once else sum(counted))
             if (line := _note_too_few(name, criteria[name], known, measure.horizon_s)) is not None:
                 yield line
-    elif asked:
+    elif names:
         yield (
-            f"criteria {', '.join(asked)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
+            f"criteria {', '.join(names)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
             "whatever the runs; `population: these_logs` asks about these recordings"
         )
 

@@ -196,7 +196,7 @@ def _list_before(
 
 @callee
 def _find_allowed_pairs(
-    here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
+    new: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
     """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
 
@@ -206,8 +206,8 @@ def _find_allowed_pairs(
     widest = 0.0
     for c in by_x:
         widest = max(widest, clusters[c].ee)
-    for i in range(len(here)):
-        entry = here[i]
+    for i in range(len(new)):
+        entry = new[i]
         reach = np.sqrt(gate * (widest + entry.ee))
         # The window of a later entry may begin further left where its covariance is larger.
         while low > 0 and clusters[by_x[low - 1]].x_m >= entry.x_m - reach:
@@ -232,7 +232,7 @@ def _find_allowed_pairs(
             volume = np.log(det)
             row[n], col[n], cost[n], spread[n] = i, by_x[p], d2 + volume, volume
             n += 1
-    spread_component_maximum(row[:n], col[:n], spread[:n], len(here), len(by_x))
+    spread_component_maximum(row[:n], col[:n], spread[:n], len(new), len(by_x))
     for p in range(n):
         cost[p] -= gate + spread[p] + _SURPLUS
     return row, col, cost, spread, n

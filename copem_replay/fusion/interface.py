@@ -219,11 +219,11 @@ def _check_lists(answer: ObjectLists, fusion: ListFusion, inputs: Inputs, where:
     return answer
 
 
-def pair_problem(given: object) -> str | None:
+def pair_problem(answer: object) -> str | None:
     """What is wrong with the form of the answer of `resume`; None: it is a pair."""
-    if isinstance(given, tuple) and len(given) == 2:
+    if isinstance(answer, tuple) and len(answer) == 2:
         return None
-    return f"resume: expected ObjectLists and a memory, found {type(given).__name__}"
+    return f"resume: expected ObjectLists and a memory, found {type(answer).__name__}"
 
 
 def form_problem(answer: object, inputs: Inputs) -> str | None:
@@ -339,12 +339,12 @@ class RecordedFusion(ListFusion):
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
         """At each instant the newest list that arrives; `unit_ix` is −1, as no unit contributes."""
-        which = np.array([_newest_list(inputs, k) for k in range(len(inputs.issue_s))], dtype=np.int64)
+        newest = np.array([_newest_list(inputs, k) for k in range(len(inputs.issue_s))], dtype=np.int64)
         begin = inputs.lists.start
-        lengths = (begin[:, 1:] - begin[:, :-1])[:, which]
+        lengths = (begin[:, 1:] - begin[:, :-1])[:, newest]
         ends = np.cumsum(lengths.ravel()).reshape(lengths.shape)
         start = np.concatenate([np.append(0, ends[:-1, -1:].ravel())[:, None], ends], axis=1)
-        first = np.repeat(begin[:, :-1][:, which].ravel() - (ends - lengths).ravel(), lengths.ravel())
+        first = np.repeat(begin[:, :-1][:, newest].ravel() - (ends - lengths).ravel(), lengths.ravel())
         entries = inputs.lists.entries[first + np.arange(len(first))]
         entries["unit_ix"] = -1
         _drop_repeated_tracks(entries, np.repeat(np.arange(lengths.size), lengths.ravel()))

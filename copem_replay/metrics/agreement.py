@@ -51,11 +51,11 @@ class Agreement:
         """One line, without the map's name."""
         if self.share is None:
             return "agreement with the traffic unknown: no vehicle moves"
-        told = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
-        told += " vehicles are in a lane of their heading"
+        line = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
+        line += " vehicles are in a lane of their heading"
         if self.states < _FEWEST:
-            return f"{told}; too few to conclude from"
-        return told + ("; is the map in the frame of the log? (1–2 m are not seen)" if self.share < NOTED_BELOW else "")
+            return f"{line}; too few to conclude from"
+        return line + ("; is the map in the frame of the log? (1–2 m are not seen)" if self.share < NOTED_BELOW else "")
 
     @property
     def refused(self) -> bool:
@@ -167,12 +167,12 @@ class Shift:
     @property
     def words(self) -> str:
         """One line; it is printed and never applied."""
-        told = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
+        line = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
         ratio = self.elsewhere / self.score if self.score else 1.0
-        told += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"
+        line += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"
         if ratio >= _AS_GOOD:
-            told += f": not determined along {self.elsewhere_deg:.0f}° (from east towards north)"
-        return f"{told}; nothing is moved by itself (`offset_m` of the map does it)"
+            line += f": not determined along {self.elsewhere_deg:.0f}° (from east towards north)"
+        return f"{line}; nothing is moved by itself (`offset_m` of the map does it)"
 
 
 def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift | None:
@@ -191,11 +191,11 @@ def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift 
     move_m = np.where(scores >= _EQUAL * scores.max(), np.hypot(*np.meshgrid(steps_m, steps_m, indexing="ij")), np.inf)
     i, j = np.unravel_index(int(move_m.argmin()), scores.shape)  # of equals the nearest to where the map is
     away_m = np.hypot(*np.meshgrid(steps_m - steps_m[i], steps_m - steps_m[j], indexing="ij"))
-    others = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
-    k, m = np.unravel_index(int(others.argmax()), others.shape)
+    scores_away = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
+    k, m = np.unravel_index(int(scores_away.argmax()), scores_away.shape)
     direction = math.degrees(math.atan2(steps_m[m] - steps_m[j], steps_m[k] - steps_m[i])) % 180.0
     east_m, north_m = -float(steps_m[i]) + 0.0, -float(steps_m[j]) + 0.0  # the traffic moved that way, so the map back
-    return Shift(east_m, north_m, float(scores[i, j]), float(others[k, m]), direction)
+    return Shift(east_m, north_m, float(scores[i, j]), float(scores_away[k, m]), direction)
 
 
 class _HeadingRaster:

@@ -79,17 +79,17 @@ def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, 
     return episodes.join_passes(parts)
 
 
-def _first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
-    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), seen.object_ix.max(initial=-1))) + 2, -1)
+def _first_listed_s(perceived: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
+    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), perceived.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode, captured_s = episode_of[seen.row_object_ix], seen.entry_captured_s
-    in_units = np.array([name in units for name in seen.units], dtype=bool)[seen.row_unit_ix]
-    rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(seen.common_arrives_s)[seen.frame_ix])
+    episode, captured_s = episode_of[perceived.row_object_ix], perceived.entry_captured_s
+    in_units = np.array([name in units for name in perceived.units], dtype=bool)[perceived.row_unit_ix]
+    rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(perceived.common_arrives_s)[perceived.frame_ix])
     during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
     from_s = episodes.counts_from_s(count_earlier=count_earlier)
     rows = rows[during & (captured_s[rows] >= from_s[episode[rows]])]
-    first_s = np.full((len(seen.valid), len(episodes.object_ix)), np.inf)
-    for s, valid in enumerate(seen.valid):
+    first_s = np.full((len(perceived.valid), len(episodes.object_ix)), np.inf)
+    for s, valid in enumerate(perceived.valid):
         listed = rows[valid[rows]]
         np.minimum.at(first_s[s], episode[listed], captured_s[listed])
     return np.where(np.isfinite(first_s), first_s, np.nan)
@@ -325,12 +325,12 @@ def measure_distances(
     return distance_m, gap_m
 
 
-def box_gap(state: Mapping[str, Float], ego: Reference, both: np.ndarray) -> Float:
-    """(K,) horizontal distance (m) between the boxes, 0 where they touch; NaN where `both` is False."""
+def box_gap(state: Mapping[str, Float], ego: Reference, present: np.ndarray) -> Float:
+    """(K,) horizontal distance (m) between the boxes, 0 where they touch; NaN where `present` is False."""
     import shapely
 
-    gap = np.full(len(both), np.nan)
-    rows = np.flatnonzero(both)
+    gap = np.full(len(present), np.nan)
+    rows = np.flatnonzero(present)
     box = shapely.polygons(
         rectangle_corners(*(state[n][rows] for n in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
     )

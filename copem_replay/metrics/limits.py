@@ -130,9 +130,9 @@ class Clusters:
         """The kind of the limits of a share."""
         return BOUNDED if self.once else EXACT
 
-    def select(self, kept: Bool) -> Clusters:
-        """The clusters of some of the rows, `kept (n,)`."""
-        return replace(self, number=np.unique(self.number[kept], return_inverse=True)[1], unit=self.unit[kept])
+    def select(self, mask: Bool) -> Clusters:
+        """The clusters of some of the rows, `mask (n,)`."""
+        return replace(self, number=np.unique(self.number[mask], return_inverse=True)[1], unit=self.unit[mask])
 
     def weigh(self, weight: Float) -> Float:
         """(K,) sums of `weight (n,)`."""
@@ -184,13 +184,13 @@ def find_clusters(table: pd.DataFrame, *, of_runs: bool = False, weigh: str = OB
     name, names = pd.factorize(table["object_id"].astype(str), sort=True)
     unit, units = pd.factorize(log * max(len(names), 1) + name, sort=True)
     episode, episodes = pd.factorize(table["episode"].to_numpy() if "episode" in table else np.zeros(len(table), int))
-    one, passes = pd.factorize(unit * max(len(episodes), 1) + episode)
+    pass_ix, passes = pd.factorize(unit * max(len(episodes), 1) + episode)
     over = "runs" if of_runs else choose_over(len(logs), len(units), len(passes))
     if over is None:
         return None
     run: Any = pd.factorize(table["run"], sort=True)[0] if "run" in table else np.zeros(len(table), dtype=np.int64)
-    number = {"logs": log, "objects": unit, "passes": one, "runs": run}[over]
-    return Clusters(over, number, one if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
+    number = {"logs": log, "objects": unit, "passes": pass_ix, "runs": run}[over]
+    return Clusters(over, number, pass_ix if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
 
 
 def describe_clusters(over: str, number: int | None = None, fewest: int | None = None, driving: bool = False) -> str:
@@ -238,11 +238,11 @@ def exact_limits(successes: float | Float, n: float | Float, confidence: float =
 
     tail = (1.0 - confidence) / 2
     k, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(n, dtype=float))
-    none, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
+    is_zero, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
     failures = np.where(all_of_them, 0.0, n - k)
-    low = betaincinv(np.where(none, 1.0, k), failures + 1.0, tail)
-    high = betaincinv(np.where(none, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - tail)
-    return np.where(none, 0.0, low), np.where(all_of_them, 1.0, high)
+    low = betaincinv(np.where(is_zero, 1.0, k), failures + 1.0, tail)
+    high = betaincinv(np.where(is_zero, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - tail)
+    return np.where(is_zero, 0.0, low), np.where(all_of_them, 1.0, high)
 
 
 def limit_share(
@@ -315,9 +315,9 @@ def spread_share(
     n, clusters = weights.sum(axis=-1), (weights > 0).sum(axis=-1)
     counted = n / (1.0 + within * ((weights**2).sum(axis=-1) / n - 1.0))
     spread = share * (1.0 - share)
-    told = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
-    ratio = stdtrit(np.where(told, n - 1.0, 1.0), tail) / stdtrit(np.where(told, clusters - 1.0, 1.0), tail)
-    by_spread = np.where(told, spread / np.where(told, variance, 1.0) * ratio**2, np.inf)
+    varies = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
+    ratio = stdtrit(np.where(varies, n - 1.0, 1.0), tail) / stdtrit(np.where(varies, clusters - 1.0, 1.0), tail)
+    by_spread = np.where(varies, spread / np.where(varies, variance, 1.0) * ratio**2, np.inf)
     effective = np.maximum(np.minimum(counted, by_spread), 1.0)
     return exact_limits(np.clip(share, 0.0, 1.0) * effective, effective, confidence)
 
@@ -382,16 +382,16 @@ def figure_variance(value: Float, without: Float, weights: Float) -> tuple[Float
     samples", Survey Methodology 28 (2002) 169–181, whose formula for a mean this is, with a jackknife's residuals.
     """
     u = weights / weights.sum(axis=-1, keepdims=True)
-    rest = np.where(u < 1.0, 1.0 - u, 1.0)
+    rest_share = np.where(u < 1.0, 1.0 - u, 1.0)
     error = np.where(u > 0, (1.0 - u) * (value[..., None] - without), 0.0)
     squares = (u**2).sum(axis=-1)[..., None, None]
     crossed = u[..., :, None] * u[..., None, :]
     Q = crossed * (squares - u[..., :, None] - u[..., None, :])
     place = np.arange(u.shape[-1])
     Q[..., place, place] += u**2
-    Q /= np.sqrt(rest[..., :, None] * rest[..., None, :])
+    Q /= np.sqrt(rest_share[..., :, None] * rest_share[..., None, :])
     trace = np.trace(Q, axis1=-2, axis2=-1)
-    return (error**2 / rest).sum(axis=-1), trace**2 / (Q**2).sum(axis=(-2, -1))
+    return (error**2 / rest_share).sum(axis=-1), trace**2 / (Q**2).sum(axis=(-2, -1))
 
 
 def limit_figure(
@@ -512,8 +512,8 @@ def limit_left_out(
     if unseen is not None:
         low, high = limit_bounded_mean(value, without, weights, bounds, 1.0, confidence, unseen)
         share = weights / weights.sum()
-        apart = np.where(share > 0, (1.0 / np.where(share > 0, share, 1.0) - 1.0) * (value - without), 0.0)
-        spread = math.sqrt(float(share @ apart**2) * len(share) / (len(share) - 1))
+        deviation = np.where(share > 0, (1.0 / np.where(share > 0, share, 1.0) - 1.0) * (value - without), 0.0)
+        spread = math.sqrt(float(share @ deviation**2) * len(share) / (len(share) - 1))
         return LimitedFigure(value, float(low), float(high), BOUNDED, bounds=bounds, spread=spread)
     if np.abs(without - value).max() > _ROUNDING:
         limits, kind = limit_figure(value, without, weights, bounds, confidence), JACKKNIFE

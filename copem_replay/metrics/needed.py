@@ -118,15 +118,15 @@ def count_deciding(
     value = figure.value if figure.value is not None else math.nan
     level = find_level(metric)
     if figure.share is not None and level is not None:
-        found = count_in_logs(count_for_share(figure.share[1], level, confidence), known)
+        count = count_in_logs(count_for_share(figure.share[1], level, confidence), known)
     elif figure.bounds is not None and not math.isnan(figure.spread):
-        found = count_for_mean(value, bound, figure.bounds, figure.spread, confidence)
+        count = count_for_mean(value, bound, figure.bounds, figure.spread, confidence)
     elif "share" in metric and not paired:
-        found = count_in_logs(count_for_share(value, bound, confidence), known)
+        count = count_in_logs(count_for_share(value, bound, confidence), known)
     else:
         half = (figure.high - figure.low) / 2
-        found = count_for_figure(value, bound, half, known.clusters, confidence)
-    return None if math.isnan(found) or found > _MOST else math.ceil(round(found, 6))
+        count = count_for_figure(value, bound, half, known.clusters, confidence)
+    return None if math.isnan(count) or count > _MOST else math.ceil(round(count, 6))
 
 
 def count_in_logs(objects: float, known: Known) -> float:
@@ -146,14 +146,14 @@ def count_at_best(
     """The fewest that can meet a criterion, all being as good as possible; None: as many as there are, or unknown."""
     level = find_level(metric)
     if level is not None:
-        found = count_in_logs(count_for_share(1.0, level, confidence), known)
+        count = count_in_logs(count_for_share(1.0, level, confidence), known)
     elif "share" in metric:
-        found = count_in_logs(count_for_share(float(direction == "at_least"), bound, confidence), known)
+        count = count_in_logs(count_for_share(float(direction == "at_least"), bound, confidence), known)
     elif metric.removesuffix("_exact") in _TO_HORIZON and direction == "at_most" and bound > 0:
-        found = count_for_mean(0.0, bound, (0.0, horizon_s), 0.0, confidence)
+        count = count_for_mean(0.0, bound, (0.0, horizon_s), 0.0, confidence)
     else:
         return None
-    return None if found <= known.clusters or math.isinf(found) else math.ceil(round(found, 6))
+    return None if count <= known.clusters or math.isinf(count) else math.ceil(round(count, 6))
 
 
 def find_enough_horizon(metric: str, bound: float, known: Known, confidence: float = CONFIDENCE) -> float | None:

@@ -189,18 +189,18 @@ Sums = Mapping[str, Mapping[str, OwnSums]]
 
 
 def summarise_rows(
-    rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **given: Any
+    rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **extra: Any
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and notes, from rows of `detections.parquet`. `given`: as for `summarise_tally`."""
-    own, asked = own_sums_by_log(rows, given.get("own", ())), "conflict_detected" in rows
-    return summarise_tally(tally_rows(rows), configurations, list_rate_hz, sums=own, conflicts_asked=asked, **given)
+    """The rows of `summary.csv`, and notes, from rows of `detections.parquet`. `extra`: as for `summarise_tally`."""
+    sums, implied = own_sums_by_log(rows, extra.get("own", ())), "conflict_detected" in rows
+    return summarise_tally(tally_rows(rows), configurations, list_rate_hz, sums=sums, conflicts_asked=implied, **extra)
 
 
-def own_sums_by_log(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
+def own_sums_by_log(rows: pd.DataFrame, metrics: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
     """Sums of own metrics by configuration and name, over rows of `detections.parquet`, added log by log."""
     sums: dict[str, dict[str, OwnSums]] = {}
-    for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if own else ():
-        sums = add_own_sums(sums, {str(name): own_sums(own, part)})
+    for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if metrics else ():
+        sums = add_own_sums(sums, {str(name): own_sums(metrics, part)})
     return sums
 
 
@@ -413,12 +413,12 @@ def _needless_lines(summary: pd.DataFrame, width: int | None) -> list[str]:
 def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:
     """The columns of a part, the limits of its share beside it; below them the set-up that all have alike."""
     names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
-    alike = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
-    names = [name for name in names if name not in alike]
+    shared = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
+    names = [name for name in names if name not in shared]
     if share:
         summary = summary.assign(**{"95 %": _interval_lines(summary, share)})
         names.insert(names.index(share) + 1, "95 %")
-    below = [f"all configurations: {', '.join(f'{name} {value}' for name, value in alike.items())}"] if alike else []
+    below = [f"all configurations: {', '.join(f'{name} {value}' for name, value in shared.items())}"] if shared else []
     return [format_table(summary[names], width), *below]
 
 
@@ -474,14 +474,14 @@ def _align_column(column: Sequence[str], *, to_left: bool) -> list[str]:
 def _split_columns(first: Sequence[str], others: Sequence[list[str]], width: int | None) -> list[list[list[str]]]:
     """The other columns in groups that fit beside the first one; each group has at least one."""
     blocks: list[list[list[str]]] = []
-    used = 0
+    width_used = 0
     for column in others:
         size = len(_GAP) + len(column[0])
-        if not blocks or (width is not None and used + size > width and blocks[-1]):
+        if not blocks or (width is not None and width_used + size > width and blocks[-1]):
             blocks.append([])
-            used = len(first[0])
+            width_used = len(first[0])
         blocks[-1].append(column)
-        used += size
+        width_used += size
     return blocks
 
 

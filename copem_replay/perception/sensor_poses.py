@@ -251,14 +251,14 @@ def find_enclosing_solid(
 
 
 def _ground_or_assumed(
-    truth: Tracks, given_m: float | None, corners: Float, what: str, far_m: dict[str, float] | None
+    truth: Tracks, given_m: float | None, corners: Float, label: str, far_m: dict[str, float] | None
 ) -> float:
-    """Ground of corners (K, 2): as given, or of the nearest object, noted in `far_m` as `what` where it is far."""
+    """Ground of corners (K, 2): as given, or of the nearest object, noted in `far_m` as `label` where it is far."""
     if given_m is not None:
         return given_m
     ground_m, distance_m = find_ground(truth, corners)
     if far_m is not None and distance_m > FAR_GROUND_M:
-        far_m[what] = distance_m
+        far_m[label] = distance_m
     return ground_m
 
 

@@ -155,15 +155,15 @@ def measure_sight(
     if names is None or any(name not in experiment.modelled for name in names):
         return SightTimes(*np.full((3, 1, episodes), np.nan))
     modelled, every = list(experiment.modelled), list(experiment.units)
-    patterns, which = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
-    runs = max(len(until_s), len(which))
-    until_s, which = np.broadcast_to(until_s, (runs, episodes)), np.broadcast_to(which.ravel(), runs)
+    patterns, pattern_ix = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
+    runs = max(len(until_s), len(pattern_ix))
+    until_s, pattern_ix = np.broadcast_to(until_s, (runs, episodes)), np.broadcast_to(pattern_ix.ravel(), runs)
     times = np.empty((3, runs, episodes))
     for k, there in enumerate(patterns):
-        own = spans.of_units({modelled.index(name) for name, present in zip(names, there, strict=True) if present})
-        of = np.flatnonzero(which == k)
-        each, then_s = np.tile(np.arange(episodes), len(of)), until_s[of].ravel()
-        times[0, of] = own.first_s(IN_SIGHT, episodes)
+        group = spans.of_units({modelled.index(name) for name, present in zip(names, there, strict=True) if present})
+        run_ix = np.flatnonzero(pattern_ix == k)
+        episode, then_s = np.tile(np.arange(episodes), len(run_ix)), until_s[run_ix].ravel()
+        times[0, run_ix] = group.first_s(IN_SIGHT, episodes)
         for row, state in enumerate((OUT_OF_VIEW, HIDDEN), start=1):
-            times[row, of] = own.seconds(state, each, then_s).reshape(len(of), episodes)
+            times[row, run_ix] = group.seconds(state, episode, then_s).reshape(len(run_ix), episodes)
     return SightTimes(*times)

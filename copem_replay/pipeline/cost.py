@@ -98,15 +98,15 @@ def estimate_size(replay: Replay) -> Size:
     return len(measured) * len(experiment.configurations), states * len(experiment.modelled)
 
 
-def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:
+def memory_notes(ready: Sequence[Replay], experiment: Experiment, other_sizes: Sequence[Size] = ()) -> list[str]:
     """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do.
 
-    `others`: sizes of further logs.
+    `other_sizes`: sizes of further logs.
     """
-    sizes, free, runs = [*map(estimate_size, ready), *others], free_bytes(), experiment.runs
+    sizes, free, runs = [*map(estimate_size, ready), *other_sizes], free_bytes(), experiment.runs
     rows_a_run = sum(rows for rows, _ in sizes)
-    about = rows_a_run * ABOUT_BYTES * runs + max((views for _, views in sizes), default=0) * OBSERVED_BYTES
-    if free is None or about <= free:
+    expected_bytes = rows_a_run * ABOUT_BYTES * runs + max((views for _, views in sizes), default=0) * OBSERVED_BYTES
+    if free is None or expected_bytes <= free:
         return []
     rows = f"{runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
     least = rows_a_run * AT_LEAST_BYTES[experiment.measure.accuracy] * runs
@@ -115,7 +115,7 @@ def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequen
         raise ExperimentError(
             f"{rows} take at least {_format_gb(least)}, and {_format_gb(free)} are free; take {few} or fewer"
         )
-    return [f"{rows} may take {_format_gb(about)}, and {_format_gb(free)} are free"]
+    return [f"{rows} may take {_format_gb(expected_bytes)}, and {_format_gb(free)} are free"]
 
 
 def free_bytes() -> int | None:

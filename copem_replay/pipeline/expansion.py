@@ -106,14 +106,14 @@ def _find_ideal(experiment: Experiment, configuration: Configuration) -> tuple[s
     """
     if configuration.recorded is None and isinstance(configuration.fusion, IdealFusion):
         return None, None
-    own, same = _list_inputs(experiment, configuration), {}
+    own_inputs, candidates = _list_inputs(experiment, configuration), {}
     for name, other in experiment.configurations.items():
         if other.recorded is None and other.fusion == IdealFusion():
             inputs = _list_inputs(experiment, other)
-            if own[0] and inputs[0] == own[0]:
-                same[name] = inputs == own
-    alike = next((name for name, is_alike in same.items() if is_alike), None)
-    return alike or next(iter(same), None), None if not same else "units" if alike is None else "inputs"
+            if own_inputs[0] and inputs[0] == own_inputs[0]:
+                candidates[name] = inputs == own_inputs
+    alike = next((name for name, is_alike in candidates.items() if is_alike), None)
+    return alike or next(iter(candidates), None), None if not candidates else "units" if alike is None else "inputs"
 
 
 def _find_remembering(experiment: Experiment, configuration: Configuration) -> str | None:
@@ -317,14 +317,14 @@ def _replace_units(
 
 def expand_members(experiment: ExpandedExperiment) -> ExpandedExperiment:
     """The experiment in which each unit that fuses is a configuration of its members, and no unit."""
-    kept = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
+    keep = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
     names = list(experiment.units)
     given = {name: getattr(experiment, name) for name in Experiment.model_fields}
     given["configurations"] = {name: unit.as_configuration() for name, unit in experiment.fusing.items()}
     return _replace_units(
         Experiment.model_construct(**given),
-        {names[k]: experiment.units[names[k]] for k in kept},
-        tuple(experiment.named[k] for k in kept), tuple(experiment.carrier[k] for k in kept), experiment.share[kept],
+        {names[k]: experiment.units[names[k]] for k in keep},
+        tuple(experiment.named[k] for k in keep), tuple(experiment.carrier[k] for k in keep), experiment.share[keep],
     )  # fmt: skip
 
 
@@ -354,14 +354,14 @@ def _replace_members(
     for name, configuration in configurations.items():
         changed: dict[str, object] = {}
         if not isinstance(configuration.units, str):
-            changed["units"] = tuple(one for unit in configuration.units for one in members[unit])
+            changed["units"] = tuple(member for unit in configuration.units for member in members[unit])
         if isinstance(configuration.latency_s, dict):
             changed["latency_s"] = {
-                one: value for unit, value in configuration.latency_s.items() for one in members.get(unit, [unit])
+                member: value for unit, value in configuration.latency_s.items() for member in members.get(unit, [unit])
             }
         if isinstance(configuration.link, dict):
             changed["link"] = {
-                one: link for unit, link in configuration.link.items() for one in members.get(unit, [unit])
+                member: link for unit, link in configuration.link.items() for member in members.get(unit, [unit])
             }
         result[name] = configuration.model_copy(update=changed)
     return result
@@ -395,9 +395,9 @@ def group_runs(experiment: ExpandedExperiment, log: str, runs: Int, *, entries_a
     equipped = experiment.equipped(log, runs)
     if entries_alone and not experiment.arrivals_differ:
         return [everyone if equipped is None else replace(everyone, listing=equipped)]
-    patterns, which = everyone.listing, np.zeros(len(runs), dtype=np.int64)
+    patterns, pattern_ix = everyone.listing, np.zeros(len(runs), dtype=np.int64)
     if equipped is not None:
-        patterns, which = np.unique(equipped, axis=0, return_inverse=True)
+        patterns, pattern_ix = np.unique(equipped, axis=0, return_inverse=True)
     if experiment.runs_apart:
-        return [RunGroup(runs[s : s + 1], patterns[k][None], patterns[k]) for s, k in enumerate(which.tolist())]
-    return [RunGroup(runs[which == k], present[None], present) for k, present in enumerate(patterns)]
+        return [RunGroup(runs[s : s + 1], patterns[k][None], patterns[k]) for s, k in enumerate(pattern_ix.tolist())]
+    return [RunGroup(runs[pattern_ix == k], present[None], present) for k, present in enumerate(patterns)]

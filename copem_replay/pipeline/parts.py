@@ -115,7 +115,7 @@ class BucketStore:
     @cached_property
     def _listed(self) -> set[str]:
         fs, path = self._opened
-        with reraise_in_one_line(self.url, what=_OPTION):
+        with reraise_in_one_line(self.url, prefix=_OPTION):
             fs.invalidate_cache()
             check_answering(self.url, fs, f"{path}/{MARK}")
             paths = await_server(self.where, lambda _: fs.find(path), works=True)
@@ -130,7 +130,7 @@ class BucketStore:
         fs, path = self._opened
         if name not in self._listed:
             return None
-        with reraise_in_one_line(f"{self.url}/{name}", what=_OPTION):
+        with reraise_in_one_line(f"{self.url}/{name}", prefix=_OPTION):
             try:
                 content: bytes = await_server(self.where, lambda _: fs.cat_file(f"{path}/{name}"))
             except FileNotFoundError:  # removed after the listing
@@ -231,15 +231,15 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
         of_part["tags"] = experiment.tags
     if experiment.has_areas:
         of_part["areas_named"] = True  # a column of the rows, of a log without areas, too
-    own = own_components(
+    components = own_components(
         configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
         experiment.braking, *(experiment.pems[pem] for pem in pems),
         *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links), *experiment.maps,
     )  # fmt: skip
     for key in NOT_OF_A_PART:
-        within, _, last = key.rpartition(".")
-        (data[within] if within else data).pop(last, None)
-    return data | of_part, own
+        section, _, last = key.rpartition(".")
+        (data[section] if section else data).pop(last, None)
+    return data | of_part, components
 
 
 def _list_dependencies(experiment: Experiment, configuration: Configuration) -> list[str]:
@@ -259,14 +259,14 @@ def own_components(*models: BaseModel | None) -> list[Component | MapFile]:
     return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency | MapFile)]
 
 
-def file_digests(own: Sequence[Component | MapFile], read: TruthTopic | TruthFields) -> dict[str, str]:
+def file_digests(parts: Sequence[Component | MapFile], read: TruthTopic | TruthFields) -> dict[str, str]:
     """SHA-256 of the files that define own components (not of what they import), of recorded latencies, of maps, and of
     definitions of messages.
     """
-    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
+    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in parts if is_own(type(one))}}
     contents = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
-    contents |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
-    maps = {one.file: one.sha256 for one in own if isinstance(one, MapFile)}
+    contents |= {one.file: repr(one.sorted_s).encode() for one in parts if isinstance(one, RecordedLatency)}
+    maps = {one.file: one.sha256 for one in parts if isinstance(one, MapFile)}
     definitions = [] if read.definitions is None else sorted(Path(str(read.definitions)).rglob("*.msg"))
     contents |= {str(path): path.read_bytes() for path in definitions}
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()} | maps
@@ -350,9 +350,9 @@ class PartCache:
             return None
         return facts if isinstance(facts, dict) else None
 
-    def keep(self, about: str, said: Mapping[str, Any]) -> None:
-        """Keep facts of a log under `about`. Raises OutputError."""
-        self.store.write(_record_name(about), _seal(canonical_json(said).encode()))
+    def keep(self, key: str, facts: Mapping[str, Any]) -> None:
+        """Keep facts of a log under `key`. Raises OutputError."""
+        self.store.write(_record_name(key), _seal(canonical_json(facts).encode()))
 
     def forget(self, about: str) -> None:
         """Remove the facts of a log under `about`. Raises OutputError."""

@@ -74,13 +74,13 @@ _AFTER = 0.381966
 def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[TimeChunk, ...]:
     """A log in time chunks of about as many observation rows each."""
     rows = observation_rows(scene, truth, experiment)
-    fusions = [one.fusion for one in experiment.configurations.values()]
+    fusions = [c.fusion for c in experiment.configurations.values()]
     whole = any(isinstance(one, IdealFusion) and one.memory is not None for one in fusions)
     if (
         rows <= ROWS_AT_ONCE
         or whole
         or experiment.fusing
-        or not all(one.resumable for one in fusions if isinstance(one, ListFusion))
+        or not all(fusion.resumable for fusion in fusions if isinstance(fusion, ListFusion))
     ):
         return (TimeChunk(),)
     _, bounds = truth.by_frame
@@ -130,15 +130,15 @@ class TruthCache:
         """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
         return self._keep(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
 
-    def _keep(self, kept: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
+    def _keep(self, cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
         """What is kept of these instants, else what `compute` gives, which replaces the oldest."""
         key = time_s.tobytes()
-        found = kept.get(key)
-        if found is None:
-            found = kept[key] = compute(time_s)
-            for oldest in list(kept)[:-KEPT]:
-                kept.pop(oldest, None)
-        return found
+        value = cache.get(key)
+        if value is None:
+            value = cache[key] = compute(time_s)
+            for oldest in list(cache)[:-KEPT]:
+                cache.pop(oldest, None)
+        return value
 
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
@@ -246,8 +246,8 @@ class Replay:
 
     def _keep_observed(self, other: Replay) -> Replay:
         """Another log, with what modelled units observe of this one: it is computed once."""
-        kept = ("_whole", "no_rows", "measured", "truth_cache", "_overview", "measured_truth")
-        vars(other).update({name: getattr(self, name) for name in kept})
+        shared = ("_whole", "no_rows", "measured", "truth_cache", "_overview", "measured_truth")
+        vars(other).update({name: getattr(self, name) for name in shared})
         return other
 
     def find_episodes_of(self, experiment: Experiment) -> Episodes:
@@ -321,7 +321,7 @@ class Replay:
         if chunk == TimeChunk():
             return self._whole
         begin_s = chunk.from_s if from_s is None else from_s
-        return self._observe(chunk, begin_s, kept=self._shares, cut_s=chunk.from_s, as_read=True)
+        return self._observe(chunk, begin_s, cache=self._shares, cut_s=chunk.from_s, as_read=True)
 
     def _observe(self, chunk: TimeChunk, from_s: float, **how: Any) -> Observations:
         """The observation rows of a time chunk; lists, which are those of the whole log, are in memory once."""
@@ -343,17 +343,17 @@ class Replay:
         """How many observation rows are kept: all of a log in one time chunk, of others those of measured objects."""
         return self._overview[2] if len(self.chunks) > 1 else len(self._whole.tracks.frame_ix)
 
-    def add_recorded(self, seen: Tracks, recorded: RecordedUnits | None) -> Tracks:
+    def add_recorded(self, tracks: Tracks, recorded: RecordedUnits | None) -> Tracks:
         """What modelled units list, and then lists of recorded ones; units are in the experiment's order."""
         if recorded is None:
-            return seen
+            return tracks
         lists = recorded.tracks
-        lists = replace(lists, valid=np.broadcast_to(lists.valid, (len(seen.valid), len(lists.frame_ix))))
-        both = join_tracks((*seen.units, *lists.units), [seen, lists])
+        lists = replace(lists, valid=np.broadcast_to(lists.valid, (len(tracks.valid), len(lists.frame_ix))))
+        joined = join_tracks((*tracks.units, *lists.units), [tracks, lists])
         # It decides between lists that arrive together.
         names = tuple(self.expanded.units)
-        place = np.array([names.index(name) for name in both.units])
-        return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
+        place = np.array([names.index(name) for name in joined.units])
+        return replace(joined, units=names, unit_ix=place[joined.unit_ix], frame_unit_ix=place[joined.frame_unit_ix])
 
     @cached_property
     def paths(self) -> RadioPath:
@@ -410,11 +410,11 @@ def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Expe
     scene = recording.scene
     if scene.ego_ix < 0:
         driven = experiment.ego != NO_EGO  # a log that says it has none lacks verdicts, and no other log does
-        for key, asked in (
+        for key, setting in (
             ("braking", driven and experiment.braking),
             ("measure.conflict", experiment.measure.conflict),
         ):
-            if asked:
+            if setting:
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
     expanded = expand_experiment(experiment, scene)
     truth = interpolate_at_instants(

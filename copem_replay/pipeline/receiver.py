@@ -170,11 +170,11 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     entries = lists.entries[first:last]
     frame = np.repeat(np.arange(len(issue_s)), np.diff(lists.start[run]))
     object_ix = np.where(matches.role[first:last] == MATCH, matches.object_ix[first:last], -1)
-    alone = (object_ix < 0) & (entries["track_id"] < 0)
-    identity = np.where(object_ix >= 0, 0, np.where(alone, np.arange(len(entries)), entries["track_id"]))
-    order = np.lexsort((frame, identity, alone, object_ix))
+    untracked = (object_ix < 0) & (entries["track_id"] < 0)
+    identity = np.where(object_ix >= 0, 0, np.where(untracked, np.arange(len(entries)), entries["track_id"]))
+    order = np.lexsort((frame, identity, untracked, object_ix))
     new = np.ones(len(order), dtype=bool)
-    for key in (object_ix, alone, identity):
+    for key in (object_ix, untracked, identity):
         new[1:] &= key[order][1:] == key[order][:-1]
     new[1:] = ~new[1:]
     start = np.append(np.flatnonzero(new), len(order))
@@ -182,10 +182,10 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     captured = np.where(newest >= 0, received.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
     captures = stamps, captured, issue_s
     fused = make_entry_tracks("fused", entries[order], start, object_ix[order][start[:-1]], frame[order], captures)
-    none = np.zeros(len(order) + 1, dtype=np.int64)
+    zeros = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
     second_of = np.where(matches.role[first:last] == DUPLICATE, matches.object_ix[first:last], -1)[order]
-    return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s, second_of=second_of)
+    return FusedTracks(fused, received, zeros[:0], zeros, None, entries[order], stated_s=stated_s, second_of=second_of)
 
 
 def make_entry_tracks(
@@ -443,21 +443,21 @@ class Receivers:
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        lists, same, _ = remove_truth_ids(world)
-        stated, captured_s = self._state_captures(received), None
-        if stated is not None:
-            lists, captured_s = stated.as_told(lists), stated.stated_s
+        lists, object_of, _ = remove_truth_ids(world)
+        captures, captured_s = self._state_captures(received), None
+        if captures is not None:
+            lists, captured_s = captures.as_told(lists), captures.stated_s
         inputs = make_inputs(received, lists, max_age_s=max_age_s, instants=instants, captured_s=captured_s)
         if (partial := output.origin.partial).any():
-            sent = SentEntries(lists.start[0], same)
-            kept = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
-            inputs = add_kept_entries(inputs, kept, partial, max_age_s)
+            sent = SentEntries(lists.start[0], object_of)
+            cached = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
+            inputs = add_kept_entries(inputs, cached, partial, max_age_s)
         where = f"configurations.{name}.fusion"
         if fusion.resumable:
             fused, self._memory[name] = ask_resumed_fusion(fusion, inputs, self._memory.get(name), where)
         else:  # a log with such a fusion is one time chunk
             fused = ask_fusion(fusion, inputs, where)
-        return self._reach_origin(world, replace(output, fused=fused, tells_of=fusion.tells_of, stated=stated))
+        return self._reach_origin(world, replace(output, fused=fused, tells_of=fusion.tells_of, stated=captures))
 
     def _reach_origin(self, world: WorldChunk, output: ReceiverOutput) -> ReceiverOutput:
         """The output, its origin reaching back to the lists of its oldest entries: a track may coast for long."""
@@ -495,15 +495,15 @@ class Receivers:
     def _fuse_once(self, name: str, output: ReceiverOutput) -> FusedOnce:
         """What ideal fusion makes of lists. Later lists of the same captures, as in a sweep, are fused once."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        partial, kept = output.origin.partial, None
+        partial, cached = output.origin.partial, None
         if partial.any():
-            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
-        beside = find_lists_beside_newest(received, instants, kept)
-        parts = (instants.newest, *beside, *(() if kept is None else [kept.entry]))
+            cached = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
+        beside = find_lists_beside_newest(received, instants, cached)
+        parts = (instants.newest, *beside, *(() if cached is None else [cached.entry]))
         captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
         if last is None or last.sent is not output.sent or last.captures != captures:
-            own = output.scene.ego_ix
-            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=instants, kept=kept)
+            ego = output.scene.ego_ix
+            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=ego, instants=instants, cached=cached)
             self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
         return last
 
@@ -547,8 +547,8 @@ class Reach:
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
                 arrives_s, captured_s = lists.common_arrives_s[schedule.arrived], lists.captured_s[schedule.arrived]
                 ahead_s = 0.0
-                if stated is not None and (told := stated[name]) is not None:  # it looks back in stated captures
-                    captured_s, ahead_s = told.stated_s[schedule.arrived], told.ahead_s
+                if stated is not None and (claim := stated[name]) is not None:  # it looks back in stated captures
+                    captured_s, ahead_s = claim.stated_s[schedule.arrived], claim.ahead_s
                 newest_s = np.maximum.accumulate(captured_s)
                 self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
 
@@ -571,13 +571,13 @@ def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int, Int]:
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
     Third, (N,): the row of each entry.
     """
-    experiment, seen = world.experiment, world.sent("sampled")
+    experiment, tracks = world.experiment, world.sent("sampled")
     rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
-    words, (claims, same) = world.words, world.claims
-    random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
+    words, (claims, object_of) = world.words, world.claims
+    random_key = RandomKey(tracks.units, tracks.row_unit_ix, words, tracks.stamp_ns[tracks.frame_ix])
     drawn = rng.uniform("order in the list", random_key, world.group.runs)
-    lists, picked = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
+    lists, entry_rows = make_entry_lists(tracks, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, np.empty(0, dtype=np.int64), picked
-    pairs = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
-    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), picked
+        return lists, np.empty(0, dtype=np.int64), entry_rows
+    pairs = np.stack([tracks.row_unit_ix[entry_rows].astype(np.uint64), object_of[entry_rows]])
+    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), entry_rows

@@ -174,13 +174,13 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
     judges = {name: Judge(log, units, name, receivers.issue_s(name), matches=matched) for name in fused}
     began_s = time.perf_counter()
     for world in receivers.worlds():
-        seen = world.sightings(lists.states)  # perceive
-        sightings.append(seen.in_lists_of(sightings[0] if sightings else seen))
-        around = log.truth_cache_of(world.chunk)
+        observed = world.sightings(lists.states)  # perceive
+        sightings.append(observed.in_lists_of(sightings[0] if sightings else observed))
+        cache = log.truth_cache_of(world.chunk)
         for name, judge in judges.items():
             output = receivers.fuse(world, name)  # transmit, fuse
-            matches = judge.match(around, output)
-            judge.measure(around, output, matches)
+            matches = judge.match(cache, output)
+            judge.measure(cache, output, matches)
     took_s = time.perf_counter() - began_s
 
     listed = sightings[0] if len(sightings) == 1 else splice_rows(sightings, states=False)[0]
@@ -204,7 +204,7 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     log, units, measure = lists.log, lists.experiment, lists.experiment.measure
     configuration = units.configurations[name]
     names, of_truth = units.units_of(configuration), configuration.units == TRUTH
-    listed, made = (log.measured_truth, lists.truth) if of_truth else (listed, lists.lists)
+    listed, ready = (log.measured_truth, lists.truth) if of_truth else (listed, lists.lists)
     received = lists.receive(listed if of_truth else lists.send(listed), name)
     detections = known or detect_by_truth_id(
         received, log.episodes, confirm=measure.confirm, count_earlier=measure.count_earlier,
@@ -216,7 +216,7 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     if units.has_way(name):
         informing = find_informing_list(received, detections)
         arriving = lists.arriving(name).common_arrives_s
-        way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (made.common_arrives_s, arriving)))
+        way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (ready.common_arrives_s, arriving)))
     until_s = np.fmin(np.fmin(listed_s, detections.captured_s), log.episodes.ended_s)
     sensing = None if of_truth else units.list_sensing(names)
     sight = measure_sight(log.sight_spans, units, sensing, lists.group.listing, until_s)

@@ -95,15 +95,15 @@ class StudyLog:
             self._whole = read
         return self._whole
 
-    def _check_same(self, read: Recording, about: str) -> None:
+    def _check_same(self, read: Recording, key: str) -> None:
         """Raises RecordingError where the content differs from that of the kept facts, which are then removed."""
-        if (found := read_content_digest(read)) == self.digests["sha256"]:
+        if (sha := read_content_digest(read)) == self.digests["sha256"]:
             return
-        if self.parts is not None and about:
-            self.parts.forget(about)
+        if self.parts is not None and key:
+            self.parts.forget(key)
         expected = self.digests["sha256"]
         raise RecordingError(
-            f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {found[:12]}…; "
+            f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {sha[:12]}…; "
             "run the command again, and it is replayed as it is now",
             path=first_recording(read.place),
         )
@@ -144,25 +144,25 @@ class StudyLog:
             self._facts = experiment, self._find_facts(resolve_for_log(experiment, self.name))
         return self._facts[1]
 
-    def _find_facts(self, alone: Experiment) -> LogFacts:
+    def _find_facts(self, local: Experiment) -> LogFacts:
         if self.parts is None:
-            return LogFacts.of(self.whole(), self.replay(), alone)
+            return LogFacts.of(self.whole(), self.replay(), local)
         recording = self.recording
         seen = None if recording.stamps is None else _drop_paths(recording.stamps)
-        about = survey_key(recording.place, alone, seen)
-        asked = isinstance(recording, StoredLog) and recording.about == about
-        kept = self.known if asked else self.parts.known(about)
-        if kept is not None and kept["scene"]["log"] == self.name:
-            return LogFacts.read(kept["facts"])
+        key = survey_key(recording.place, local, seen)
+        is_known = isinstance(recording, StoredLog) and recording.about == key
+        stored = self.known if is_known else self.parts.known(key)
+        if stored is not None and stored["scene"]["log"] == self.name:
+            return LogFacts.read(stored["facts"])
         replay = self.replay()
-        facts = LogFacts.of(self.whole(), replay, alone)
+        facts = LogFacts.of(self.whole(), replay, local)
         notes = [as_finding(note).as_json() for note in recording.notes]
-        said = {
+        facts_json = {
             "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": notes,
             "host": recording.host_id, **self.digests, "states": self.object_states, "frames": self.frames,
             "facts": facts.as_json(),
         }  # fmt: skip
-        self.parts.keep(about, said)
+        self.parts.keep(key, facts_json)
         return facts
 
 
@@ -198,19 +198,19 @@ def drop_content(recording: Recording, read: Callable[[], Recording]) -> StoredL
     return StoredLog(**known, said=compute_log_digests(recording) | said, read=read)
 
 
-def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:
+def survey_key(place: Place, experiment: Experiment, stamps: Sequence[Stamp] | None = None) -> str:
     """All that the facts of a log depend on: its files and the experiment, resolved for it, as canonical JSON.
 
-    `seen`: the stamps of the files when they were read; None: those that they have now.
+    `stamps`: the stamps of the files when they were read; None: those that they have now.
     """
-    of_all, own = _survey_parts(experiment)
+    common, components = _survey_parts(experiment)
     ahead_ns = place.ahead_ns if isinstance(place, DriveRecordings) else ()
     return canonical_json(
         {
-            "files": file_stamps(place) if seen is None else seen,
+            "files": file_stamps(place) if stamps is None else stamps,
             "ahead_ns": ahead_ns,
-            "of": of_all,
-            "own": file_digests(own, experiment.read),
+            "of": common,
+            "own": file_digests(components, experiment.read),
         }
     )
 
@@ -238,23 +238,23 @@ def recall_log(
 ) -> StoredLog | None:
     """A log by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
     try:
-        about = survey_key(place, experiment)
+        key = survey_key(place, experiment)
     except RecordingError:  # reading the recording reports it
         return None
-    if (kept := parts.known(about)) is None:
+    if (facts := parts.known(key)) is None:
         return None
     first = first_recording(place)
     return StoredLog(
-        scene=scene_from_json(kept["scene"]),
+        scene=scene_from_json(facts["scene"]),
         path=Path(first.name) if isinstance(first, RemoteFile) else first,
-        topic=kept["topic"],
-        notes=tuple(Finding(*note) if isinstance(note, list) else note for note in kept["notes"]),
-        host_id=kept["host"],
+        topic=facts["topic"],
+        notes=tuple(Finding(*note) if isinstance(note, list) else note for note in facts["notes"]),
+        host_id=facts["host"],
         together=place if isinstance(place, DriveRecordings) else None,
         remote=place if isinstance(place, RemoteFile) else None,
-        said=kept,
+        said=facts,
         read=read,
-        about=about,
+        about=key,
     )
 
 

@@ -102,14 +102,14 @@ class WorldChunk:
             scene, experiment, runs = self.scene, self.experiment, self.group.runs
             equipped = self.group.listing
             modelled = [k for k, unit in enumerate(experiment.units.values()) if unit.pem is not None]
-            there = None if equipped.all() else equipped[:, modelled]
-            seen = perceive(scene, self.observations, experiment, runs, states=states, equipped=there)
+            present = None if equipped.all() else equipped[:, modelled]
+            tracks = perceive(scene, self.observations, experiment, runs, states=states, equipped=present)
             if states != "expected" and (ghosts := self.ghosts) is not None:
                 drawn, true = make_ghost_draws(scene, ghosts, experiment, int(runs[0])), ghosts.observations.tracks
-                seen = append_tracks(seen, add_states(scene, true, ghosts.observations, experiment, drawn))
-            seen = remove_outages(scene, self.log.add_recorded(seen, self.recorded), experiment, runs)
+                tracks = append_tracks(tracks, add_states(scene, true, ghosts.observations, experiment, drawn))
+            tracks = remove_outages(scene, self.log.add_recorded(tracks, self.recorded), experiment, runs)
             rng = CounterRng(experiment.seed, scene.log)
-            self._listed[states] = delay_until_ready(seen, experiment.ready, rng, runs)
+            self._listed[states] = delay_until_ready(tracks, experiment.ready, rng, runs)
         return self._listed[states]
 
     def sent(self, states: States) -> Tracks:
@@ -125,12 +125,12 @@ class WorldChunk:
 
         Those of time chunks are held until the last one: without states.
         """
-        seen, log = self.listed(states), self.log
+        tracks, log = self.listed(states), self.log
         if len(log.chunks) == 1:
-            return seen
-        own = seen.valid.any(axis=0) & (seen.row_captured_s >= self.chunk.from_s)
-        rows = np.flatnonzero(own & np.isin(seen.row_object_ix, log.episodes.object_ix))
-        return seen.take_rows(rows, states=False)
+            return tracks
+        in_chunk = tracks.valid.any(axis=0) & (tracks.row_captured_s >= self.chunk.from_s)
+        rows = np.flatnonzero(in_chunk & np.isin(tracks.row_object_ix, log.episodes.object_ix))
+        return tracks.take_rows(rows, states=False)
 
     @cached_property
     def words(self) -> Words:
@@ -274,12 +274,12 @@ class Transmission:
 
 def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
     """Whether a link depends on the path to the receiver. Raises ExperimentError where the path is not known."""
-    asked = False
+    by_path = False
     for name, configuration in experiment.configurations.items():
         for unit_links in experiment.links_of(name):
             if not (isinstance(unit_links.link, Radio) and unit_links.link.loses and unit_links.link.reception.by_path):
                 continue
-            asked, where = True, f"{scene.log}: {unit_links.where}.reception: {unit_links.link.reception.kind}"
+            by_path, where = True, f"{scene.log}: {unit_links.where}.reception: {unit_links.link.reception.kind}"
             if scene.ego_ix < 0:
                 raise ExperimentError(
                     f"{where}: the distance to a receiver is unknown, for the log has no ego; use constant"
@@ -290,7 +290,7 @@ def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
             if far:
                 source = "of the truth" if far == [TRUTH] else f"of unit {far[0]}, whose lists are recorded,"
                 raise ExperimentError(f"{where}: the distance {source} to a receiver is not known; use constant")
-    return asked
+    return by_path
 
 
 def has_channel(experiment: ExpandedExperiment) -> bool:
@@ -326,11 +326,11 @@ class SentObjects:
     partial: Bool
     keys: Words
 
-    def of(self, seen: Tracks, words: Words) -> Tracks:
+    def of(self, tracks: Tracks, words: Words) -> Tracks:
         """The rows that are sent; `words`: those of their objects."""
-        left_out = self.partial[seen.row_unit_ix] & ~np.isin(_key_rows(seen.frame_ix, words), self.keys)
-        arrives_s = np.where(self.lists, seen.common_arrives_s, np.inf)
-        return replace(seen, valid=seen.valid & ~left_out & self.lists[seen.frame_ix], arrives_s=arrives_s[None])
+        left_out = self.partial[tracks.row_unit_ix] & ~np.isin(_key_rows(tracks.frame_ix, words), self.keys)
+        arrives_s = np.where(self.lists, tracks.common_arrives_s, np.inf)
+        return replace(tracks, valid=tracks.valid & ~left_out & self.lists[tracks.frame_ix], arrives_s=arrives_s[None])
 
 
 def _key_rows(frame_ix: Int, words: Words) -> Words:
@@ -348,34 +348,34 @@ def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldCh
     slots: dict[tuple[int, int], int] = {}
     lists, keys = np.zeros(0, dtype=bool), [np.zeros(0, dtype=np.uint64)]
     for world in chunks:
-        chunk, seen, (claims, same) = world.chunk, world.listed("sampled"), world.claims
+        chunk, tracks, (claims, object_of) = world.chunk, world.listed("sampled"), world.claims
         if not len(lists):
-            lists = np.ones(len(seen.stamp_ns), dtype=bool)
+            lists = np.ones(len(tracks.stamp_ns), dtype=bool)
         frames = np.flatnonzero(
-            sending[seen.frame_unit_ix] & np.isfinite(seen.common_arrives_s)
-            & (seen.captured_s >= chunk.from_s) & (seen.captured_s < chunk.until_s)
+            sending[tracks.frame_unit_ix] & np.isfinite(tracks.common_arrives_s)
+            & (tracks.captured_s >= chunk.from_s) & (tracks.captured_s < chunk.until_s)
         )  # fmt: skip
-        frames = frames[np.argsort(seen.captured_s[frames], kind="stable")]
-        order, bounds = seen.by_frame
+        frames = frames[np.argsort(tracks.captured_s[frames], kind="stable")]
+        order, bounds = tracks.by_frame
         counts = np.diff(bounds)[frames]
         begin = np.cumsum(counts) - counts
         listed = order[np.repeat(bounds[frames] - begin, counts) + np.arange(counts.sum())]
-        valid = seen.valid[0, listed]
+        valid = tracks.valid[0, listed]
         start = np.append(0, np.cumsum(valid))[np.append(begin, len(listed))]
         listed = listed[valid]
-        pairs, which = np.unique(
-            np.stack([seen.row_unit_ix[listed].astype(np.uint64), same[listed]]), axis=1, return_inverse=True
+        pairs, pair_ix = np.unique(
+            np.stack([tracks.row_unit_ix[listed].astype(np.uint64), object_of[listed]]), axis=1, return_inverse=True
         )
         slot = np.array([slots.setdefault((u, w), len(slots)) for u, w in pairs.T.tolist()], dtype=np.int64)
         sent, included = last.choose(
             ListedObjects(
-                start, seen.frame_unit_ix[frames], seen.captured_s[frames], slot[which.ravel()], world.words[listed],
-                np.isin(claims.class_probability[listed].argmax(axis=1), _VRU), _sampled_states(seen, listed),
-                claims.existence[listed],
+                start, tracks.frame_unit_ix[frames], tracks.captured_s[frames], slot[pair_ix.ravel()],
+                world.words[listed], np.isin(claims.class_probability[listed].argmax(axis=1), _VRU),
+                _sampled_states(tracks, listed), claims.existence[listed],
             )
         )  # fmt: skip
         lists[frames[~sent]] = False
-        keys.append(_key_rows(seen.frame_ix[listed[included]], world.words[listed[included]]))
+        keys.append(_key_rows(tracks.frame_ix[listed[included]], world.words[listed[included]]))
     return SentObjects(lists, partial, np.sort(np.concatenate(keys)))
 
 

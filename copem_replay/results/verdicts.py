@@ -281,13 +281,13 @@ def read_verdicts(path: Path) -> Judgement:
         *rows, last = [parse_json(line) for line in lines]
         verdicts = Judgement(path.parent.name, tuple(_parse_verdict(k, row) for k, row in enumerate(rows, start=1)))
         total = {"verdicts": len(rows), **verdicts.count(), "passes": verdicts.passes}
-        found = dict(last["total"])
-        digest = found.pop("sha256")
+        stored = dict(last["total"])
+        digest = stored.pop("sha256")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"{path}: expected verdicts as they were written, found damage: {why}; {_JUDGE}") from None
-    if found != total:
-        raise InputError(f"{path}: expected a total of {total}, found {found}; {_JUDGE}")
+    if stored != total:
+        raise InputError(f"{path}: expected a total of {total}, found {stored}; {_JUDGE}")
     if digest != _digest_lines(lines[:-1]):
         raise InputError(f"{path}: expected the lines that were written, found others (SHA-256); {_JUDGE}")
     return verdicts
@@ -301,11 +301,11 @@ _KINDS: dict[str, tuple[type, ...]] = {
 
 def _parse_verdict(number: int, row: Any) -> Verdict:
     """A verdict of a line, whose word is that of its limits. Raises ValueError, KeyError, TypeError."""
-    for of in fields(Verdict):
-        value, kinds = row[of.name], [kind.strip() for kind in str(of.type).split("|")]
+    for column in fields(Verdict):
+        value, kinds = row[column.name], [kind.strip() for kind in str(column.type).split("|")]
         allowed = [one for kind in kinds for one in _KINDS.get(kind, ())]
         if not (value is None and "None" in kinds) and type(value) not in allowed:
-            raise ValueError(f"line {number}: {of.name}: expected {' or '.join(kinds)}, found {value!r}")
+            raise ValueError(f"line {number}: {column.name}: expected {' or '.join(kinds)}, found {value!r}")
     verdict = Verdict(**row)
     expected = {verdict.verdict} & {*WORDS}
     if verdict.low is not None or verdict.high is not None:

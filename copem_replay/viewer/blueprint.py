@@ -302,12 +302,12 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
         share = _curves_view(origin, SHARE_TITLE, content.axis(k), values=(-0.05, 1.05))
-        beside: rrb.View | rrb.Container = share
+        right_side: rrb.View | rrb.Container = share
         if content.helps(k):
             origin = make_entity_path(*helps_path(content.replay.scene, k))
             helps = rrb.TextDocumentView(origin=origin, name="What would help")
-            beside = rrb.Vertical(share, helps, row_shares=[2, 1])
-        lower_row = rrb.Horizontal(lanes_view(content, k), beside, column_shares=[3, 2])
+            right_side = rrb.Vertical(share, helps, row_shares=[2, 1])
+        lower_row = rrb.Horizontal(lanes_view(content, k), right_side, column_shares=[3, 2])
         first_s, last_s = content.axes_s[k]
         name = f"{short_ids(content.replay.scene)[k]} · {first_s:.1f}–{last_s:.1f} s"
         rows = [3, 2] if len(content.configurations) <= MANY else [1, 1]
@@ -327,12 +327,12 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
         return []
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
     between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
-    chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
+    names = dict.fromkeys([ranked[0], *between, ranked[-1]])
     titles = {
         name: f"{name}: known {show_seconds(s)} s after the onset" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
     }
-    return [(name, titles[name]) for name in chosen]
+    return [(name, titles[name]) for name in names]
 
 
 def tracks_page(content: RecordingContent) -> rrb.Container:

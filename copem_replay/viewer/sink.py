@@ -125,17 +125,17 @@ def file_stream(path: Path, application_id: str, recording_id: str) -> Iterator[
     import rerun as rr
 
     with atomic_file(path) as scratch:
-        out, into = os.pipe()
-        pump = _Pump(out, scratch)
+        read_fd, write_fd = os.pipe()
+        pump = _Pump(read_fd, scratch)
         rec = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         try:
             if not rr.is_enabled(rec):
                 raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
-            rec.save(f"/dev/fd/{into}")
+            rec.save(f"/dev/fd/{write_fd}")
             yield rec
         finally:
             rec.disconnect()  # writes the end of the file
-            os.close(into)
+            os.close(write_fd)
             pump.join()
         if pump.error is not None:
             raise pump.error
@@ -235,11 +235,11 @@ class RecordingSink:
         """Wait until all that was sent has left this process, so that little of it is held in memory."""
         self.rec.flush()
 
-    def static(self, path: Sequence[str], *what: Any) -> None:
+    def static(self, path: Sequence[str], *components: Any) -> None:
         """Write components that hold at all times."""
         import rerun as rr
 
-        self.send(lambda rec: rec.log(rr.new_entity_path(list(path)), *what, static=True))
+        self.send(lambda rec: rec.log(rr.new_entity_path(list(path)), *components, static=True))
 
     def columns(self, path: Sequence[str], elapsed_ns: Int, columns: Any) -> None:
         """Write columns with a row per instant (F,), ns since the log's start."""
@@ -333,16 +333,16 @@ def object_labels(scene: Scene) -> pa.Array:
     return pa.array(names, pa.string())
 
 
-def sort_by_frame(tracks: Tracks, kept: Bool) -> tuple[Int, Int]:
-    """The rows (P,) with `kept`, list by list, and their number per list (F,)."""
+def sort_by_frame(tracks: Tracks, drawn: Bool) -> tuple[Int, Int]:
+    """The rows (P,) with `drawn`, list by list, and their number per list (F,)."""
     order, _ = tracks.by_frame
-    rows = order[kept[order]]
+    rows = order[drawn[order]]
     return rows, np.bincount(tracks.frame_ix[rows], minlength=len(tracks.stamp_ns))
 
 
-def slice_by_frame(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]:
+def slice_by_frame(tracks: Tracks, drawn: Bool) -> Iterator[tuple[Int, Int, Int]]:
     """`sort_by_frame` in pieces of whole lists, of about `SLICE_ROWS` rows; with the instants of each piece (ns)."""
-    rows, counts = sort_by_frame(tracks, kept)
+    rows, counts = sort_by_frame(tracks, drawn)
     ends = np.cumsum(counts)
     available_ns = elapsed_ns(tracks)
     frame = row = 0

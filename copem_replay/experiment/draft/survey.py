@@ -85,7 +85,7 @@ def survey_recording(place: Local | str) -> RecordingSurvey:
     beside = [t.topic for t in survey.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=name_log(path), topic=topic, beside=beside)
+            recording = read_log(log, name=name_log(path), topic=topic, unit_topics=beside)
         except RecordingError as error:
             failures.append(str(error))
             continue
@@ -200,7 +200,7 @@ def _survey_truth(
     between_s = np.diff(truth.stamp_ns) * 1e-9
     longest = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
-    found = list(_survey_units(recording.local, scene, units, recording))
+    found_units = list(_survey_units(recording.local, scene, units, recording))
     return TruthFound(
         topic=recording.topic,
         frames=len(truth.stamp_ns),
@@ -223,9 +223,9 @@ def _survey_truth(
         notes=list(recording.notes),
         place=_describe_place(log, recording),
         vehicles=moving_ids(scene, shown=6),
-        units=found,
+        units=found_units,
         map=_try_map(recording) if recording.together is None and any(t.role == "map" for t in topics) else None,
-        suggested=suggest_experiment(log, recording, found, fields),
+        suggested=suggest_experiment(log, recording, found_units, fields),
     )
 
 
@@ -347,13 +347,13 @@ class ClockFound:
         `untold`.
         """
         offset = self.offset
-        told = offset.untold is None
+        known = offset.untold is None
         return {
             "lists": list(self.lists),
-            "clock_offset_s": offset.offset_s if told else None,
-            "interval_s": [offset.low_s, offset.high_s] if told else None,
-            "drift": offset.drift[0] if told and offset.drift else None,
-            "drift_interval": list(offset.drift[1:]) if told and offset.drift else None,
+            "clock_offset_s": offset.offset_s if known else None,
+            "interval_s": [offset.low_s, offset.high_s] if known else None,
+            "drift": offset.drift[0] if known and offset.drift else None,
+            "drift_interval": list(offset.drift[1:]) if known and offset.drift else None,
             "entries": offset.entries,
             "if_not_shifted": offset.unbiased,
             "untold": offset.untold,
@@ -383,7 +383,7 @@ def compare_clocks(paths: Sequence[Path]) -> list[ClockFound]:
     return [_find_best(path, lists_of[0], lists) for path, lists in zip(paths[1:], lists_of[1:], strict=True)]
 
 
-def _find_best(path: Path, first: Sequence[_TimedLists], others: Sequence[_TimedLists]) -> ClockFound:
+def _find_best(path: Path, first: Sequence[_TimedLists], second: Sequence[_TimedLists]) -> ClockFound:
     """The offset with the narrowest interval, among the pairs of lists with the fewest unknown delays."""
     from copem_replay.io.clock_offset import estimate_time_offset
 
@@ -392,13 +392,11 @@ def _find_best(path: Path, first: Sequence[_TimedLists], others: Sequence[_Timed
             path,
             (a.name, b.name),
             estimate_time_offset(a.entries, b.entries),
-            tuple(one.name for one in (a, b) if not one.captures_said),
+            tuple(timed.name for timed in (a, b) if not timed.captures_said),
         )
-        for a, b in product(first, others)
+        for a, b in product(first, second)
     ]
-    return min(
-        clocks, key=lambda one: (one.offset.untold is not None, len(one.late), one.offset.high_s - one.offset.low_s)
-    )
+    return min(clocks, key=lambda c: (c.offset.untold is not None, len(c.late), c.offset.high_s - c.offset.low_s))
 
 
 def _read_timed_lists(log: Log, label: str, t0_ns: int) -> Iterator[_TimedLists]:

@@ -116,13 +116,13 @@ def make_site(
     """
     import shapely
 
-    wanted = [shape for shape in shapes if hides(shape.tags) and not shape.geometry.is_empty]
-    if not wanted:
+    hiding = [shape for shape in shapes if hides(shape.tags) and not shape.geometry.is_empty]
+    if not hiding:
         return SiteMap(degrees=degrees, assumed=_list_counts(counts), licence=licence)
-    middle = np.median(shapely.get_coordinates([shape.geometry for shape in wanted]), axis=0)
+    middle = np.median(shapely.get_coordinates([shape.geometry for shape in hiding]), axis=0)
     scale = _metres_per_degree(float(middle[1])) if degrees else np.ones(2)
     blocks = list[_Block]()
-    for shape in wanted:
+    for shape in hiding:
         geometry = shapely.transform(shape.geometry, lambda places: (places - middle) * scale)
         blocks += _make_blocks(shape._replace(geometry=geometry), heights_m, counts)
     solids = [_make_map_solid(block) for block in _cut_outlines(blocks, counts)]
@@ -216,13 +216,13 @@ def _cut_outlines(blocks: Sequence[_Block], counts: Counter[str]) -> Iterator[_B
         inside = (
             [parts[k] for k in tree.query(block.footprint, predicate="intersects")] if block.role == "outline" else []
         )
-        rest = block.footprint.difference(shapely.union_all(inside)) if inside else block.footprint
-        if rest.area > block.footprint.area - 0.5:
+        remainder = block.footprint.difference(shapely.union_all(inside)) if inside else block.footprint
+        if remainder.area > block.footprint.area - 0.5:
             yield block
             continue
-        rest = rest.buffer(-_SLIVER_M / 2).buffer(_SLIVER_M / 2, join_style="mitre")
+        remainder = remainder.buffer(-_SLIVER_M / 2).buffer(_SLIVER_M / 2, join_style="mitre")
         counts["outline of a building with parts: what they leave is taken"] += 1
-        for piece in shapely.get_parts(rest):
+        for piece in shapely.get_parts(remainder):
             if piece.geom_type == "Polygon" and piece.area > _LEAST_REST_M2:
                 yield block._replace(footprint=piece)
 

@@ -67,16 +67,16 @@ class Aggregator:
             episode_of, first, count, np.cumsum(count) - count, episodes.onset_s, episodes.ended_s
         )
         self._issue_s, self._reference, self._settings = issue_s, reference, settings
-        self._parameters = asked = make_parameters(settings, measured_class)
+        self._parameters = params = make_parameters(settings, measured_class)
         S, M, L = runs, len(episodes.object_ix), int(count.sum())
         self._out = AccuracySums(
             np.full((S, L), np.nan, dtype=np.float32),
             np.full((S, L), np.nan, dtype=np.float32),
             np.zeros((S, M), dtype=OBJECT),
             np.zeros(S, dtype=RUN),
-            np.zeros((S, len(asked.existence_thresholds)), dtype=np.int64),
-            np.zeros((S, max(len(asked.distance_edges_m) - 1, 0)), dtype=BAND),
-            np.zeros((S, max(len(asked.time_edges_s) - 1, 0)), dtype=BAND),
+            np.zeros((S, len(params.existence_thresholds)), dtype=np.int64),
+            np.zeros((S, max(len(params.distance_edges_m) - 1, 0)), dtype=BAND),
+            np.zeros((S, max(len(params.time_edges_s) - 1, 0)), dtype=BAND),
             np.zeros((S, EXISTENCE_BINS), dtype=EXISTENCE),
         )
         self._out.by_run["lists"] = reference.present.sum()
@@ -85,10 +85,10 @@ class Aggregator:
         self._states = EpisodeStates(np.full((S, M), -1), np.tile(episodes.onset_s, (S, 1)))
         self._added = 0
 
-    def add(self, lists: ObjectLists, about: Matches, now: Matches, world: Tracks) -> None:
+    def add(self, lists: ObjectLists, matches: Matches, now: Matches, world: Tracks) -> None:
         """Add the next lists.
 
-        `about`: matches at the instants the entries tell of; `now`: at the instants the lists are available. `world`:
+        `matches`: matches at the instants the entries tell of; `now`: at the instants the lists are available. `world`:
         the truth when lists are available, frame k for the k-th list. Raises ValueError for another number of runs, or
         more lists than are left.
         """
@@ -100,7 +100,7 @@ class Aggregator:
         chunk = slice(self._added, self._added + count)
         reference = self._reference
         add_up(
-            lists.start, lists.entries, take_match_columns(about), take_match_columns(now), self._issue_s[chunk],
+            lists.start, lists.entries, take_match_columns(matches), take_match_columns(now), self._issue_s[chunk],
             sort_truth_by_list(world),
             self._stays._replace(first_list=self._stays.first_list - self._added),
             reference.x_m[chunk], reference.y_m[chunk], reference.present[chunk],

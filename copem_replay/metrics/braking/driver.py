@@ -207,15 +207,15 @@ def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
     # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): compared a hair beside d, for rounding.
     at_s = reaction_delays(reaction, _TRIED)
     for hair, sign in ((1e-9, 1), (-1e-9, -1)):
-        beside = survival(np.nextafter(at_s * (1 + hair), sign * np.inf))  # of the smallest numbers a hair is none
-        assert beside is not None
-        off = np.flatnonzero((sign * (beside - (1 - _TRIED)) > 1e-6) & (at_s > 0))
+        probability = survival(np.nextafter(at_s * (1 + hair), sign * np.inf))  # of the smallest numbers a hair is none
+        assert probability is not None
+        off = np.flatnonzero((sign * (probability - (1 - _TRIED)) > 1e-6) & (at_s > 0))
         if len(off):
             k = off[0]
             raise wrong_answer_error(
                 reaction, where,
                 f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
-                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {beside[k]:g}", "survival",
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {probability[k]:g}", "survival",
             )  # fmt: skip
     return survivals
 

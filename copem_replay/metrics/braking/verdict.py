@@ -72,12 +72,12 @@ def judge_braking(encounter: Encounter, driver: Driver, brake_s: Float) -> Verdi
     begin_m, begin_mps, ever = _find_braking_start(encounter, unique)
     late = unique >= encounter.spent_s
     verdicts.required_mps2[ever & late] = np.inf
-    asked = np.flatnonzero(ever & ~late)
-    need = np.empty(len(asked))
+    braked = np.flatnonzero(ever & ~late)
+    need = np.empty(len(braked))
     find_required_deceleration(
-        encounter.time_s, encounter.stretch_m, unique[asked], begin_m[asked], begin_mps[asked], need
+        encounter.time_s, encounter.stretch_m, unique[braked], begin_m[braked], begin_mps[braked], need
     )
-    verdicts.required_mps2[asked] = need
+    verdicts.required_mps2[braked] = need
     return Verdicts(*(getattr(verdicts, name)[index] for name in Verdicts.__dataclass_fields__))
 
 

@@ -94,12 +94,12 @@ def class_row(shares: dict[str, float]) -> Float:
     return np.array([shares.get(name, 0.0) for name in CLASSES])
 
 
-def draw_classes(rows: Float, which: Int, uniform: Float) -> Int:
-    """(P,) a class for each uniform (P,), by row `which` (P,) of probabilities (R, C)."""
+def draw_classes(rows: Float, row_ix: Int, uniform: Float) -> Int:
+    """(P,) a class for each uniform (P,), by row `row_ix` (P,) of probabilities (R, C)."""
     cumulated = np.cumsum(rows, axis=1)
     cumulated[:, -1] = 1.0
     last = np.array([np.flatnonzero(row)[-1] for row in rows])  # rounding gives no share to a class of probability 0
-    listed: Int = np.minimum((uniform[:, None] >= cumulated[which]).sum(axis=1), last[which])
+    listed: Int = np.minimum((uniform[:, None] >= cumulated[row_ix]).sum(axis=1), last[row_ix])
     return listed
 
 
@@ -325,10 +325,10 @@ class Pem(Frozen):
 
     def in_vain(self) -> Iterator[str]:
         """Quantities in `memory` that no couple draws."""
-        asked = self.asked()
-        drawn = {"detection", *(asked or ())}
+        noise_names = self.asked()
+        drawn = {"detection", *(noise_names or ())}
         drawn |= {"class"} if self.classes is not None and self.classes.confusion else set()
         drawn |= {"existence"} if self._scores else set()
-        for name in self.memory if asked is not None else ():
+        for name in self.memory if noise_names is not None else ():
             if name not in drawn:
                 yield name

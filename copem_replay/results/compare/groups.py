@@ -42,11 +42,11 @@ class EpisodeGroups:
         tags = {log.name: log.tags for log in results.provenance.logs}
         episodes = results.tally.drop_duplicates([*EPISODE])
         keys = list(zip(*(episodes[name].tolist() for name in EPISODE), strict=True))
-        for by in read_slices(results, entries):
-            number, names = number_groups(episodes, by, tags)
+        for entry in read_slices(results, entries):
+            number, names = number_groups(episodes, entry, tags)
             for key, k in zip(keys, (number + len(self.named)).tolist(), strict=True):
                 self._of.setdefault(key, []).append(k)
-            self.named += [(by, ", ".join(values)) for values in names]
+            self.named += [(entry, ", ".join(values)) for values in names]
 
     def select(self, log: str, grid: PairingGrid) -> Iterator[tuple[int, Bool]]:
         """The groups that have episodes of a log, by their number, and which cells (N·S,) they have."""
@@ -54,13 +54,13 @@ class EpisodeGroups:
         for k in sorted({k for of in of_episodes for k in of}):
             yield k, np.repeat([k in of for of in of_episodes], grid.runs)
 
-    def restrict(self, k: int, kept: Bool, side: PairSide) -> PairSide:
+    def restrict(self, k: int, in_group: Bool, side: PairSide) -> PairSide:
         """A side of a pair with the cells of a group alone; by `began` each group counts its own episodes."""
-        by, counted = self.named[k][0], side.counted
-        if by.names(BEGAN_BY):
+        entry, counted = self.named[k][0], side.counted
+        if entry.names(BEGAN_BY):
             counted = side.counted_however_begun
-        lists = side.lists if by.of_logs else None
-        return replace(side, there=side.there & kept, counted=counted & kept, lists=lists)
+        lists = side.lists if entry.of_logs else None
+        return replace(side, there=side.there & in_group, counted=counted & in_group, lists=lists)
 
 
 def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
@@ -78,12 +78,12 @@ def describe_group_chance(table: pd.DataFrame) -> list[str]:
     would by chance.
     """
     lines = []
-    for by, rows in table.groupby("by", sort=False):
+    for entry, rows in table.groupby("by", sort=False):
         limited = rows[rows["interval_over"].notna()]
-        apart = int(limited["star"].notna().sum())
+        off_zero = int(limited["star"].notna().sum())
         lines.append(
-            f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
-            f"{count_noun(len(limited), 'interval')} {apart} exclude 0, by chance alone at least "
+            f"by {entry}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
+            f"{count_noun(len(limited), 'interval')} {off_zero} exclude 0, by chance alone at least "
             f"{(1 - CONFIDENCE) * len(limited):.2g} would; {int((limited['star'] == STAR).sum())} with a {STAR}, all "
             "groups held at 95 % together"
         )

@@ -286,13 +286,13 @@ class SumStatistic(PairStatistic):
     def without_each(self, clusters: ClusterIndex) -> Float:
         """(K,) differences. Items of no cluster stay, and the other clusters count for the one that is left out."""
         by_cluster, always = self._sums_by_cluster(clusters)
-        rest = by_cluster.sum(axis=0) - by_cluster
+        sums = by_cluster.sum(axis=0) - by_cluster
         if always.any():
             weights = clusters.count_objects(self.items)
             total = weights.sum()
-            rest = rest * (total / np.where(weights < total, total - weights, total))[:, None] + always
+            sums = sums * (total / np.where(weights < total, total - weights, total))[:, None] + always
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = self.of(rest)
+            first, second = self.of(sums)
             difference: Float = first - second
         return difference
 
@@ -434,16 +434,16 @@ def difference_limits(
     clusters = index_clusters(figure.items, over, names)
     if clusters is None or not (figure.by_object or over not in ("objects", "passes")):
         return {}
-    found = figure.limits(difference, clusters, confidence)
+    interval = figure.limits(difference, clusters, confidence)
     bounded = LimitedFigure(difference) if over == "runs" else figure.limit_by_bounds(difference, clusters, confidence)
     limits = {"low_bounded": bounded.low, "high_bounded": bounded.high} if bounded.kind else {}
-    if found.kind == ALL_ALIKE:
-        return {"interval": found.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
-    if not (math.isfinite(found.low) or math.isfinite(found.high)):
+    if interval.kind == ALL_ALIKE:
+        return {"interval": interval.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
+    if not (math.isfinite(interval.low) or math.isfinite(interval.high)):
         return {}
-    limits |= {"low": found.low, "high": found.high}
+    limits |= {"low": interval.low, "high": interval.high}
     return {name: limit if math.isfinite(limit) else None for name, limit in limits.items()} | {
-        "interval": found.kind,
+        "interval": interval.kind,
         "interval_over": over,
         "clusters": len(clusters.names),
     }
@@ -472,14 +472,14 @@ def find_stars(number: int, limit: Sequence[Callable[[float], Mapping[str, objec
 
     Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6 (1979) 65–70.
     """
-    held: set[int] = set()
-    while len(held) < number:
-        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(held))
-        more = {k for k, at in enumerate(limit) if k not in held and is_off_zero(at(level))}
-        if not more:
+    starred: set[int] = set()
+    while len(starred) < number:
+        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(starred))
+        added = {k for k, at in enumerate(limit) if k not in starred and is_off_zero(at(level))}
+        if not added:
             break
-        held |= more
-    return held
+        starred |= added
+    return starred
 
 
 def describe_difference(row: Mapping[str, Any], better: int, least: float) -> str:

@@ -124,7 +124,7 @@ def _add_log(
 ) -> GhostTotals:
     """The totals of the earlier logs and of one more, in the first `runs` runs."""
     lengths, existence = list_column(rows["existence"])
-    counts, at = list_column(rows["ghosts_at"])
+    counts, ghosts_at = list_column(rows["ghosts_at"])
     thresholds = existence[: lengths[0]] if len(lengths) else existence
     if before is not None and len(before.existence):
         thresholds = before.existence if len(lengths) else thresholds
@@ -137,7 +137,7 @@ def _add_log(
         )
     compared = integer_column(rows["run"], missing=runs) < runs
     minutes = float(float_column(rows["minutes"])[compared].sum())
-    ghosts = at.reshape(size)[compared].sum(axis=0).astype(np.int64)
+    ghosts = ghosts_at.reshape(size)[compared].sum(axis=0).astype(np.int64)
     steps_at = float_column(steps["existence"])[integer_column(steps["run"], missing=runs) < runs]
     least, most = float(steps_at.min(initial=np.inf)), float(steps_at.max(initial=-np.inf))
     if before is None or not len(before.existence):
@@ -171,26 +171,25 @@ def find_operating_points(
 
 
 def explain_incomparable(
-    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None, *, asked: bool, truth: bool
+    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None, *, by_user: bool, truth: bool
 ) -> str | None:
     """Why the times of two sides at `per_min` ghosts cannot be compared; None: they can, or there are none.
 
-    `asked`: whether the user asked for the rate; else it is the second side's own. `truth`: whether the second side is
-    the truth.
+    `by_user`: the user asked for the rate; else it is the second side's own. `truth`: the second side is the truth.
     """
     if per_min is None or first is None or second is None:
         return None
     if truth:
         return TRUTH
-    if not asked and second.at[:1].sum() < FEWEST_GHOSTS:
+    if not by_user and second.at[:1].sum() < FEWEST_GHOSTS:
         return FEW
     for side in (first, second):
-        kept = find_operating_point(side, per_min)
-        if side.per_min is None or kept is None or side.per_min <= per_min * (1 + 1e-9):
+        point = find_operating_point(side, per_min)
+        if side.per_min is None or point is None or side.per_min <= per_min * (1 + 1e-9):
             continue
         if not side.tells_apart:
             return ONE_VALUE if side is first else f"of the baseline, {ONE_VALUE}"
-        if kept.false_positives_per_min * side.minutes < FEWEST_GHOSTS * (1 - 1e-9):
+        if point.false_positives_per_min * side.minutes < FEWEST_GHOSTS * (1 - 1e-9):
             return FEW
     return None
 
@@ -314,9 +313,9 @@ class _Pair:
 
 
 def compute_regrets(
-    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, only: Sequence[str] | None = None
+    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, metrics: Sequence[str] | None = None
 ) -> Iterator[Regret]:
-    """The metrics of a log, all or `only` some, for which both sides have the data.
+    """The metrics of a log, all or `metrics` some, for which both sides have the data.
 
     Those of lists are over all rows that both sides have, the others over those that count.
     """
@@ -326,16 +325,16 @@ def compute_regrets(
         counts = len(np.unique(grid.object_of(pair.cells))), len(np.unique(pair.cells // grid.runs))
         pairs.append((pair, counts))
     for metric in COMPARED.values():
-        of = metric.compared
-        if of is None or (only is not None and metric.name not in only):
+        compared = metric.compared
+        if compared is None or (metrics is not None and metric.name not in metrics):
             continue
         pair, counts = pairs[0 if metric.part in OF_LISTS else 1]
-        figure = FIGURES[of.figure](pair) if isinstance(of.figure, str) else _means(pair, of.figure)
+        figure = FIGURES[compared.figure](pair) if isinstance(compared.figure, str) else _means(pair, compared.figure)
         if figure is not None:
-            held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
-            kept = pair.setting.kept if FIGURES.get(of.figure) is _means_at_equal_ghosts else None
+            held = pair.held_counts if FIGURES.get(compared.figure) in (_held_errors, _held_gospa) else None
+            points = pair.setting.kept if FIGURES.get(compared.figure) is _means_at_equal_ghosts else None
             counts = (1, 1) if metric.part == "needless" else counts  # a drive is one, whatever objects it has
-            yield Regret(metric.name, figure, (counts,), kept, held)
+            yield Regret(metric.name, figure, (counts,), points, held)
 
 
 def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatistic:
@@ -365,11 +364,11 @@ def _passes(pair: _Pair) -> SumStatistic | None:
 def _means_where_both_detect(pair: _Pair) -> SumStatistic:
     """Mean times to detection of the cells that both sides detect; `only`: the cells that one side alone does."""
     first, second = (side.rows["detected"][pair.cells] for side in pair.sides)
-    both = first & second
+    both_detect = first & second
     times_s = ((side.rows["detection_s"] - side.rows["onset_s"])[pair.cells] for side in pair.sides)
-    sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
+    sums = np.stack([*(np.where(both_detect, time_s, 0.0) for time_s in times_s), both_detect.astype(float)], axis=1)
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
-    items = pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums)
+    items = pair.items(pair.cells, n=both_detect.astype(np.int64), only=only, sums=sums)
     return SumStatistic(parts=(items,), of=_divide_mean)
 
 
@@ -436,21 +435,21 @@ HELD_METRICS = ("position_rmse_held_m", "gospa_held_m")
 
 
 def _held_errors(pair: _Pair) -> SumStatistic | None:
-    if (both := pair.held) is None:
+    if (held := pair.held) is None:
         return None
-    paired = both.pairs > 0
-    squares = np.concatenate([both.squared_m2, both.pairs[:, None]], axis=1)[paired]
-    items = pair.items(pair.cells[paired], n=both.pairs[paired], sums=squares)
+    paired = held.pairs > 0
+    squares = np.concatenate([held.squared_m2, held.pairs[:, None]], axis=1)[paired]
+    items = pair.items(pair.cells[paired], n=held.pairs[paired], sums=squares)
     return SumStatistic(parts=(items,), of=_make_power_mean(2.0))
 
 
 def _held_gospa(pair: _Pair) -> SumStatistic | None:
     """GOSPA of frames, which belong to no object, so that their number stays where objects are clusters."""
-    if (both := pair.held) is None:
+    if (held := pair.held) is None:
         return None
-    measured = both.measured > 0
-    parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
-    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.frames, [0.0, 0.0, 1.0]), both.frames)
+    measured = held.measured > 0
+    parts = np.concatenate([held.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
+    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(held.frames, [0.0, 0.0, 1.0]), held.frames)
     return SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power))
 
 
@@ -462,13 +461,13 @@ def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     present, runs = first["there"] & second["there"], pair.cells % pair.grid.runs
     cells, runs = pair.cells[present[runs]], runs[present[runs]]
     nearest = np.zeros((len(cells), 4))
-    rest = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
-    rest[~present] = 0.0
+    per_run = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
+    per_run[~present] = 0.0
     accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
     for k, accuracy_of_side in enumerate(accuracy if len(accuracy) == 2 else ()):
         nearest[:, k] = accuracy_of_side.ghosts[cells]
-        rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
-    items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
+        per_run[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(per_run))
+    items = _append_run_items(pair, cells, nearest, per_run, present.astype(np.int64))
     return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 
