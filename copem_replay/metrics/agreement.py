@@ -25,7 +25,7 @@ _MOVES_MPS: Final = 1.0
 _ALONG_RAD: Final = math.pi / 4
 
 _REACH_M: Final = 40.0
-"""The shift is sought this far from where the map is said to be."""
+"""The largest offset of the map that is searched."""
 _CELL_M: Final = 0.5
 _HEADINGS: Final = 16
 _MOST_STATES: Final = 3000
@@ -36,19 +36,19 @@ _ELSEWHERE_M: Final = 3.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """Of `states` of moving vehicles, `along` are in a lane of their heading."""
+    """The number of `states` of moving vehicles, and how many of them, `along`, are in a lane of their heading."""
 
     states: int
     along: int
 
     @property
     def share(self) -> float | None:
-        """None: no vehicle moves."""
+        """The share of states along a lane; None: no vehicle moves."""
         return self.along / self.states if self.states else None
 
     @property
     def words(self) -> str:
-        """One line, without the map's name."""
+        """The agreement in one line, without the map's name."""
         if self.share is None:
             return "agreement with the traffic unknown: no vehicle moves"
         line = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
@@ -59,7 +59,7 @@ class Agreement:
 
     @property
     def refused(self) -> bool:
-        """Whether the map cannot be where the traffic is."""
+        """Whether the share is too low for the map to be in the log's frame."""
         return self.share is not None and self.states >= _FEWEST and self.share < REFUSED_BELOW
 
 
@@ -69,19 +69,19 @@ SOLIDS_REFUSED_ABOVE: Final = 0.1
 
 @dataclass(frozen=True)
 class Inside:
-    """Of `states` of moving vehicles, `inside` are in a solid of a map."""
+    """The number of `states` of moving vehicles, and how many of them are `inside` a solid of a map."""
 
     states: int
     inside: int
 
     @property
     def share(self) -> float:
-        """0 where no vehicle moves."""
+        """The share of states inside a solid; 0 where no vehicle moves."""
         return self.inside / self.states if self.states else 0.0
 
     @property
     def words(self) -> str:
-        """One line, without the map's name; empty: nothing has to be said."""
+        """One line for a suspicious share, without the map's name; empty: nothing to report."""
         if self.states < _FEWEST or self.share <= SOLIDS_NOTED_ABOVE:
             return ""
         told = f"{self.inside:,} of {self.states:,} states of moving vehicles are inside a solid"
@@ -89,14 +89,14 @@ class Inside:
 
     @property
     def refused(self) -> bool:
-        """Whether the map cannot be where the traffic is."""
+        """Whether the share is too high for the map to be in the log's frame."""
         return self.states >= _FEWEST and self.share > SOLIDS_REFUSED_ABOVE
 
 
 def find_inside(scene: Scene, truth: Tracks, outlines: NDArray[np.object_]) -> Inside:
-    """How often the centre of a moving vehicle is in one of the outlines of solids: polygons as shapely has them.
+    """Count the states of moving vehicles whose centre is in an outline of a solid (shapely polygons).
 
-    Of a map without lanes this is what agreement can be told by.
+    It stands in for agreement where a map has no lanes.
     """
     import shapely
 
@@ -115,7 +115,7 @@ def moving_vehicle_rows(scene: Scene, truth: Tracks) -> Int:
 
 
 def find_agreement(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Agreement:
-    """Agreement of lanes, in the frame of the log, with its traffic."""
+    """The agreement of lanes, given in the log's frame, with the log's traffic."""
     rows = moving_vehicle_rows(scene, truth)
     directed = DirectedLanes(lanes)
     along = directed.are_along(truth.x_m[0, rows], truth.y_m[0, rows], truth.yaw_rad[0, rows])
@@ -123,7 +123,7 @@ def find_agreement(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Agreem
 
 
 class DirectedLanes:
-    """Lanes that are driven, cut across into quadrangles with a direction each."""
+    """Driven lanes, cut across into quadrangles with a direction each."""
 
     def __init__(self, lanes: Sequence[Lane]) -> None:
         import shapely
@@ -156,7 +156,7 @@ def _cut_lane(lane: Lane) -> tuple[Float, Float]:
 
 @dataclass(frozen=True)
 class Shift:
-    """By how much the map would have to move to agree best, and the best score more than 3 m from there."""
+    """The shift of the map that agrees best with the traffic, and the best score more than 3 m from it."""
 
     east_m: float
     north_m: float
@@ -166,7 +166,7 @@ class Shift:
 
     @property
     def words(self) -> str:
-        """One line; it is printed and never applied."""
+        """The shift in one line; it is printed and never applied."""
         line = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
         ratio = self.elsewhere / self.score if self.score else 1.0
         line += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def concatenate_columns(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Columns by name, those of each part one beneath the other. All parts have the columns of the first."""
+    """Columns by name, the parts one beneath the other. All parts have the columns of the first."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -51,14 +51,14 @@ def build_frame(columns: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def first_episodes(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the first episode of each object: what is drawn of a single run."""
+    """The rows of each object's first episode, as the plots of a single run draw them."""
     first = rows.groupby("object_id", sort=False)["episode"].transform("min") == rows["episode"]
     return rows if first.all() else rows[first]
 
 
 @dataclass(frozen=True)
 class Way:
-    """The way of each detection to the receiver. All (S | 1, M), NaN: there is none.
+    """The times of each detection's list on its way to the receiver. All (S | 1, M), NaN: there is none.
 
     `listed_s`: capture of the first list of any unit that has the object, whether it was sent and arrived or not.
     `sent_s`, `arrived_s`: of the list of the newest capture that contributed to the detection.
@@ -143,7 +143,7 @@ class DetectionEvents:
 
 
 def stack_events(blocks: Sequence[Mapping[str, DetectionEvents]], runs: Sequence[int]) -> dict[str, DetectionEvents]:
-    """Events by configuration, those of several blocks of so many runs one after the other."""
+    """Events by configuration, with the runs of several blocks stacked in order."""
     return (
         {name: _stack_parts([block[name] for block in blocks], runs) for name in blocks[0]}
         if len(blocks) > 1

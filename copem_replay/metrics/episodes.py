@@ -37,7 +37,7 @@ from copem_replay.perception.visibility import Statics, visible_shares
 
 @dataclass(frozen=True)
 class Reference:
-    """The place that distances are measured from: the ego, or a unit when there is no ego. All (K,), NaN where absent.
+    """The place that distances are measured from: the ego, or a unit where there is no ego. All (K,), NaN where absent.
 
     Its box is `length_m × width_m` around its place; a unit is a point.
     """
@@ -100,14 +100,14 @@ class Episodes:
     returns: Int
 
     def take(self, which: Int | Bool) -> Episodes:
-        """Some of the episodes."""
+        """The episodes of these indices."""
         return Episodes(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     @cached_property
     def passes(self) -> tuple[tuple[Int, Episodes], ...]:
-        """Episodes with at most one of each object, and which they are: the first of each, then the second of each, …
+        """Passes of at most one episode per object, each with its indices: all first episodes, all second ones, …
 
-        What looks up the episode of an object measures them pass by pass (`join_passes`).
+        Code that looks up the episode of an object measures pass by pass; `join_passes` puts the columns together.
         """
         if not len(self.object_ix):
             return ((np.empty(0, dtype=np.int64), self),)
@@ -117,7 +117,7 @@ class Episodes:
         return tuple((which, self.take(which)) for which in each)
 
     def join_passes(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """(…, M) the columns of all episodes, from those of each pass (…, m)."""
+        """(…, M) the columns of all episodes, from the columns of each pass (…, m)."""
         if len(parts) == 1:
             return parts[0]
         order = np.argsort(np.concatenate([which for which, _ in self.passes]))
@@ -140,13 +140,13 @@ class Episodes:
 
     @property
     def firsts(self) -> Episodes:
-        """The first episode of each object, up to where its last ends: what accuracy is measured of."""
+        """One episode per object, from its first onset to the end of its last episode: accuracy is measured in it."""
         which, first = self.passes[0]
         ends = np.append(which, len(self.object_ix))[1:] - 1
         return replace(first, ended_s=self.ended_s[ends], ended_by=self.ended_by[ends])
 
     def count_began(self) -> tuple[int, ...]:
-        """How many episodes began in each of the ways `BEGAN`."""
+        """The number of episodes by how they began, in the order of `BEGAN`."""
         return tuple(np.bincount(self.began, minlength=len(BEGAN)).tolist())
 
     def counts_from_s(self, *, count_earlier: bool) -> Float:

@@ -46,7 +46,7 @@ class LastingDetection:
     captured_s: Float
 
     def take(self, rows: Int) -> LastingDetection:
-        """The lists of these rows only."""
+        """The lists of these rows."""
         return LastingDetection(self.process[rows], self.share[rows], self.tau_s[rows], self.captured_s[rows])
 
     def log_missed(self, listed: Float, fresh: Float) -> Float:

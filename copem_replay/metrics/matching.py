@@ -45,7 +45,7 @@ _TOLERANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class Matches:
-    """What each entry of `ObjectLists` is about. All (N,)."""
+    """The true object that each entry of `ObjectLists` is about. All (N,)."""
 
     object_ix: Int  # the object it is about, −1: none
     role: NDArray[np.int8]  # MATCH, DUPLICATE or GHOST
@@ -57,7 +57,7 @@ class Matches:
 def match_entries(
     lists: ObjectLists, world: Tracks, scene: Scene, origins: Origins, *, gate_m: float, tells_of: TellsOf = "now"
 ) -> Matches:
-    """What the entries of K lists in S runs are about, at the instants they tell of.
+    """Match the entries of K lists in S runs with true objects, at the instants the entries tell of.
 
     `world`: the truth. Where entries tell of `now` its frame k is at the instant list k is available, where they tell
     of their `capture` frames are ascending, at all captures that these entries name, at least.
@@ -73,7 +73,7 @@ def match_entries(
 def match_at_both_times(
     lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, origins: Origins, *, gate_m: float
 ) -> tuple[Matches, Matches]:
-    """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
+    """Matches of entries that tell of their `capture`, at the capture and as if they told of `now`.
 
     `then`, `now`: the truth, as `match_entries` takes it for `capture` and for `now`.
     """

@@ -97,7 +97,7 @@ class Metric:
 
 
 def compared_metric(name: str, better: Literal[-1, 1], part: str, header: str, compared: Compared) -> Metric:
-    """A metric that `compare` alone has: it is of pairs."""
+    """A metric of pairs, which `compare` alone has."""
     return Metric(name, lambda _: None, lambda _: None, better, "", part, header, compared)
 
 
@@ -121,7 +121,7 @@ def _pin_limits(metrics: Sequence[Metric], row: Mapping[str, Value]) -> dict[str
 
 
 def divide_or_none(total: float, number: float) -> float | None:
-    """A mean, or a share; None: of nothing."""
+    """The quotient, a mean or a share; None where the divisor is 0."""
     return float(total) / float(number) if number > 0 else None
 
 

@@ -53,7 +53,7 @@ _SAME = 1e-9
 
 
 def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int]:
-    """Time (n,) from onset to detection or end of the episode, and kind of ending (n,).
+    """The time (n,) from onset to detection or end of the episode, and the kind of ending (n,).
 
     `rows`: of `Results.known`, or of the tally.
     """
@@ -83,7 +83,7 @@ class FigureRows:
 
     @cached_property
     def known(self) -> Bool:
-        """(n,) whether a row is for an instant, not for never."""
+        """(n,) whether the object is ever known: the row has an instant, not never."""
         known: Bool = self.table["time_to_detection_s"].notna().to_numpy(dtype=bool)
         return known
 
@@ -95,22 +95,22 @@ class FigureRows:
 
     @property
     def unknown_s(self) -> Float:
-        """(n,) seconds unknown."""
+        """(n,) seconds for which the object is unknown."""
         return compute_unknown_s(self.table["time_to_detection_s"].to_numpy(dtype=float), self.length_s)
 
     @cached_property
     def endings(self) -> tuple[Float, Int]:
-        """(n,) times, and how they end."""
+        """(n,) times of endings and (n,) their kinds, by `detection_endings`."""
         time_s, ending = detection_endings(self.table)
         return np.round(time_s, 9), ending
 
     @cached_property
     def curve(self) -> tuple[Float, Float]:
-        """The cumulative incidence: its times and values."""
+        """The cumulative incidence: its times and its values."""
         return cumulative_incidence(*self.endings, self.weight, least=self.least)
 
     def limit_share(self, successes: Float, confidence: float) -> LimitedFigure:
-        """The share of `successes (n,)`, weights of rows or parts of them."""
+        """The share of the weight that `successes (n,)` have, with limits."""
         value = float(successes.sum()) / float(self.weight.sum())
         if self.clusters is None:
             return LimitedFigure(value)
@@ -132,7 +132,7 @@ class FigureRows:
         return self._limit_mean(over, value, without, bounds, confidence, followed)
 
     def limit_mean(self, values: Float, most: float, confidence: float) -> LimitedFigure:
-        """The mean of values (n,), from 0 to `most`."""
+        """The mean of values (n,), each from 0 to `most`, with limits."""
         total = float(self.weight.sum())
         value, over = float(self.weight @ values) / total, self.clusters
         if over is None:
@@ -161,7 +161,7 @@ class FigureRows:
         return {}
 
     def limit_time_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The time by which a share q is detected; ∞: a smaller share ever is."""
+        """The time by which a share q is detected, with limits; ∞: fewer are ever detected."""
         found = quantile_time(*self.curve, q)
         value = math.inf if found is None else found
         if self.clusters is None:
@@ -187,7 +187,7 @@ class FigureRows:
         return times_s, *self.limit_incidence(np.append(before, times_s[steps]), confidence), steps
 
     def limit_incidence(self, at_s: Sequence[float] | Float, confidence: float) -> tuple[Float, Float]:
-        """Lower and upper limits (G,) of the cumulative incidence at instants (G,), ascending; there are clusters."""
+        """Lower and upper limits (G,) of the cumulative incidence at ascending instants (G,). Needs clusters."""
         assert self.clusters is not None
         over, at_s, times_s = self.clusters, np.asarray(at_s, dtype=float), self.curve[0]
         share = np.append(0.0, self.curve[1])[np.searchsorted(times_s, at_s, side="right")]
@@ -219,7 +219,7 @@ class FigureRows:
         return limit_bounded_mean(share, without, groups, (0.0, 1.0), 1.0, confidence, unseen)
 
     def limit_distance_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The distance beyond which a share 1 − q is detected; −∞: a smaller share ever is."""
+        """The distance beyond which a share 1 − q is detected, with limits; −∞: fewer are ever detected."""
         distance_m = self.table["distance_at_detection_m"].to_numpy(dtype=float)
         placed = ~self.known | ~np.isnan(distance_m)
         weight, ranked = self.weight[placed], np.where(self.known, distance_m, -np.inf)[placed]
@@ -270,7 +270,7 @@ def limit_sums(
 
 
 class JudgedMetric(NamedTuple):
-    """How a metric is taken of rows. `rows`: of which: detections, implied collisions (`conflict`), those in conflict
+    """How a metric is computed from rows. `rows`: of detections, implied collisions (`conflict`), those in conflict
     (`braking`), closed forms (`exact`, `exact braking`). `limit`: the figure, from rows, horizon, confidence, bound.
     """
 
@@ -360,7 +360,7 @@ class SummedMetric(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least that it can be: a bias has a sign."""
+        """The least possible value: a bias may be negative."""
         return -math.inf if self.sum.endswith(("east_m", "north_m")) else 0.0
 
     def value_of(self, sums: Float) -> Any:

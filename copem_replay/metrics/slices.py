@@ -50,7 +50,7 @@ Tags = Mapping[str, Mapping[str, str]]
 
 
 def find_unknown_tag(slices: Sequence[Slice], tags: Tags) -> str | None:
-    """A line on the first tag that no log has; None: there is none."""
+    """One line on the first tag that no log has; None: all are known."""
     known = sorted({name for of_log in tags.values() for name in of_log})
     for name in (name for by in slices for name in by.tags if name not in known):
         has = f"tags are {', '.join(known)}" if known else "logs have no tags"
@@ -82,7 +82,7 @@ def _name_values(table: pd.DataFrame, dimension: Dimension, tags: Tags) -> tuple
 
 
 def number_groups(table: pd.DataFrame, entry: Slice, tags: Tags) -> tuple[Int, list[tuple[str, ...]]]:
-    """(n,) the group of each row, and the groups that occur, each with its value of every dimension of the entry.
+    """(n,) the number of each row's group, and the groups, each with its value of every dimension of the entry.
 
     `table`: rows with the columns that the entry is about: `log`, `object_class`, `began`, `distance_at_onset_m`,
     `area`.
@@ -217,7 +217,7 @@ class SliceSettings:
 
 @dataclass(frozen=True)
 class StudyRows:
-    """The rows that the figures of configurations are computed from: of a whole study, of a group, of any episodes.
+    """The rows from which a configuration's figures are computed: of a study, of a group, or of any episodes.
 
     `tally`, `exact`: rows of `tally.parquet` and `exact.parquet` (None: not asked for). `sums`: of `sum_episodes`.
     `lists`: of `sum_lists`; None: without accuracy, or episodes of parts of logs, to which no false entry belongs.
@@ -245,7 +245,7 @@ class StudyRows:
 
     @cached_property
     def detections(self) -> pd.DataFrame:
-        """Of these the rows for detections, of all configurations."""
+        """The counted rows for detections, of all configurations."""
         return self.counted[self.counted["event"] == DETECTED]
 
     def _number_episodes(self, table: pd.DataFrame) -> Int:
@@ -261,7 +261,7 @@ class StudyRows:
         return {name: self._number_episodes(table) for name, table in tables.items() if table is not None}
 
     def select(self, is_kept: Bool, logs: Collection[str] | None = None) -> StudyRows:
-        """The rows of some episodes, `is_kept (E,)`. `logs`: where they are all of these logs; else None."""
+        """The rows of the episodes in `is_kept (E,)`. `logs`: where these are all episodes of the logs; else None."""
 
         def rows_of(name: str) -> Any:
             table = getattr(self, name)
@@ -289,7 +289,7 @@ class StudyRows:
         ]
 
     def inputs(self, configuration: str) -> MetricInputs:
-        """What the statistics of a configuration are computed from, as for a row of `summary.csv`."""
+        """The inputs of a configuration's statistics, as for a row of `summary.csv`."""
         settings, rows_of = self.settings, self._of(configuration)
         conflicts = rows_of(self.counted[self.counted["event"] == CONFLICT]) if settings.conflicts else None
         return MetricInputs(
@@ -347,7 +347,7 @@ class Group:
 
     @property
     def label(self) -> str:
-        """The values: `crossing, pedestrian`."""
+        """The values in words: `crossing, pedestrian`."""
         return ", ".join(self.values)
 
 
@@ -414,9 +414,7 @@ def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: 
 
 
 def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
-    """Whether an interval excludes a share; None: there is none, or the share is that of all or none, which no group
-    can stand out from.
-    """
+    """Whether an interval excludes a share that is not 0 or 1, as no group stands out from these; None: no interval."""
     low, high = figures["detected_share_low"], figures["detected_share_high"]
     if low is None or share is None or share in (0.0, 1.0):
         return None
@@ -424,9 +422,7 @@ def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
 
 
 def describe_chance(table: pd.DataFrame) -> list[str]:
-    """A line for each entry in rows of `summary_by.csv`: how many groups were looked at, how many stand out, and how
-    many would by chance.
-    """
+    """One line per entry of `summary_by.csv`: number of groups, how many stand out, and how many would by chance."""
     lines = []
     for by, rows in table.groupby("by", sort=False):
         judged = rows["apart"].dropna().astype(bool)

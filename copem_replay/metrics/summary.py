@@ -162,7 +162,7 @@ def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[s
 
 
 def describe_followed(counted: pd.DataFrame, horizon_s: float) -> str | None:
-    """How few of the episodes that count last as long as the horizon; None: enough for a restricted mean."""
+    """One line where too few counted episodes last as long as the horizon; None: enough for a restricted mean."""
     number, needed, followed, _ = _count_followed(counted, horizon_s)
     return None if followed >= needed else _format_followed(number, followed, horizon_s)
 
@@ -173,9 +173,7 @@ def _format_followed(number: int, followed: int, asked_s: float) -> str:
 
 
 def _count_followed(counted: pd.DataFrame, asked_s: float) -> tuple[int, int, int, float]:
-    """How many episodes count, how many have to last for a restricted mean, how many last `asked_s`; how long enough
-    of them last.
-    """
+    """How many episodes count, are needed for a restricted mean, last `asked_s`; how long enough of them last."""
     episodes = counted.drop_duplicates([*EPISODE])
     length_s = np.sort(np.round((episodes["ended_s"] - episodes["onset_s"]).to_numpy(dtype=float), 9))[::-1]
     number = len(length_s)
@@ -273,7 +271,7 @@ def summarise_tally(
 
 
 def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float | None, words: Sequence[str]) -> str:
-    """A line: how many episodes began how, and the mean time of each group in one configuration.
+    """One line: how many episodes began in each way, and the mean time of each group in one configuration.
 
     `tallied`: the whole tally. `words`: `measure.began`, those that count.
     """
@@ -339,7 +337,7 @@ SETUP = ("n", "list_rate_hz", "n_conflict", "driving_h", "must_brake_s")
 
 
 def describe_mean(horizon_s: float, *, censored: bool) -> str:
-    """What a restricted mean is of. `censored`: whether rows are still undetected when the ego or the log ends."""
+    """The words for a restricted mean. `censored`: whether rows are still undetected when the ego or the log ends."""
     up_to = f"{format_cell(horizon_s)} s"
     words = f"mean of min(time to detection, {up_to}), never detected counting as {up_to}"
     if not censored:
@@ -389,7 +387,7 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
 
 
 def describe_no_needless(summary: pd.DataFrame) -> str | None:
-    """How rare braking for nothing is at most where nobody does, or that it cannot be known; None: somebody does."""
+    """The upper limit of needless braking where nobody does it, or that it is unknown; None: somebody does."""
     driving_h = float(summary["driving_h"].max())
     if not driving_h > 0:
         return "braking for nothing: not known, for the ego does not drive"
@@ -432,9 +430,7 @@ def _interval_lines(summary: pd.DataFrame, share: str) -> list[str]:
 
 
 def describe_intervals(summary: pd.DataFrame, name: str) -> list[str]:
-    """Lines on the limits: their kind, from the column `name`, what they are over, and what that cannot exclude; on the
-    rows without limits as nothing is drawn.
-    """
+    """Lines on the limits: their kind (column `name`), what they are over, what they miss; on rows without limits."""
     columns = [name, f"{name}_over", f"{name}_clusters"]
     limited = summary.reindex(columns=columns).dropna(subset=columns[1]).drop_duplicates()
     kinds = [

@@ -64,7 +64,7 @@ class DetectionStatistics:
     rows: bool
 
     def quantile_s(self, q: float) -> float | None:
-        """Seconds by which a share q is detected; None: a smaller share ever is."""
+        """Seconds by which a share q is detected; None: fewer are ever detected."""
         return quantile_time(self.times_s, self.incidence, q) if self.rows else None
 
     def mean_s(self) -> float | None:

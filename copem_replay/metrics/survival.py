@@ -260,7 +260,7 @@ class EndReason(Enum):
 
     @property
     def label(self) -> str:
-        """Two words for figures."""
+        """The reason in two words, for figures."""
         return _WORDS[self][0]
 
     @property
@@ -286,6 +286,6 @@ def end_reason_texts(position: Int) -> np.ndarray:
 
 
 def is_competing(ended_by: pd.Series) -> Bool:
-    """(n,) whether texts (n,) are those of a reason that is no censoring."""
+    """(n,) whether these texts of `ended_by` name a departure, not a censoring."""
     competing: Bool = ended_by.isin(COMPETES).to_numpy(dtype=bool)
     return competing

@@ -117,7 +117,7 @@ class Aggregator:
 
 
 def make_parameters(settings: AccuracySettings, measured_class: Bool) -> AccuracyParameters:
-    """The settings as compiled code takes them. `measured_class (C,)`: as of `Aggregator`."""
+    """The settings as arrays and numbers for compiled code. `measured_class (C,)`: as of `Aggregator`."""
     return AccuracyParameters(
         settings.cutoff_m, settings.power, settings.gate_m, measured_class, _as_column(settings.distance_edges_m),
         _as_column(settings.time_edges_s), _as_column(settings.existence_thresholds),
@@ -130,12 +130,12 @@ def _as_column(values: tuple[float, ...]) -> Float:
 
 
 def take_match_columns(matches: Matches) -> EntryMatches:
-    """The matches as compiled code takes them."""
+    """The columns of the matches as arrays for compiled code."""
     return EntryMatches(matches.object_ix, matches.role, matches.x_m, matches.y_m, matches.class_ix)
 
 
 def sort_truth_by_list(truth: Tracks) -> TruthByList:
-    """The truth frame by frame, in each by object."""
+    """The rows of the truth sorted by list, and by object within a list."""
     order = np.lexsort((truth.row_object_ix, truth.frame_ix))
     columns = (getattr(truth, name)[0, order] for name in ("x_m", "y_m", "vx_mps", "vy_mps"))
     return TruthByList(truth.by_frame[1], truth.row_object_ix[order], *columns)
@@ -152,7 +152,7 @@ def _time_s(issue_s: Float, present: Bool) -> float:
 
 
 def are_annotated(x_m: Float, y_m: Float, list_ix: Int, reference: Reference, settings: AccuracySettings) -> Bool:
-    """(N,) whether places in lists are in the annotated area; `reference`: at the instants of all lists."""
+    """(N,) whether listed places are in the annotated area; `reference`: the place at the instants of all lists."""
     if not settings.annotated_m and np.isinf(settings.annotated_range_m):
         return np.ones(len(list_ix), dtype=bool)
     from_m, corners = (reference.x_m[list_ix], reference.y_m[list_ix]), polygon_corners(settings.annotated_m)

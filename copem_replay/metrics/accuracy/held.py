@@ -58,7 +58,7 @@ _FRAMES_AT_ONCE = 600
 
 @dataclass(frozen=True)
 class HeldFrames:
-    """The frames of a log at which configurations are compared, and what is there: the same for all of them."""
+    """The frames of a log at which configurations are compared, with truth and reference at each."""
 
     time_s: Float  # (G,)
     truth: TruthByList  # by frame, objects with an episode only
@@ -122,7 +122,7 @@ class HeldAccuracy:
     without_truth: Int  # (S,) held entries whose object has no truth at the frame
 
     def repeated(self, runs: int) -> HeldAccuracy:
-        """Of `runs` runs, each as the one run that stands for all."""
+        """The accuracy of `runs` equal runs, from that of one."""
         if len(self.without_truth) == runs:
             return self
         error_m, age_s, gospa = (

@@ -89,7 +89,7 @@ Records = NDArray[Any]
 
 
 class TruthByList(NamedTuple):
-    """The truth list by list, in each by object: list k has rows `start[k] : start[k + 1]`."""
+    """The truth sorted by list, then by object: list k has rows `start[k] : start[k + 1]`."""
 
     start: Int  # (K + 1,)
     object_ix: Int  # (P,), as all that follow
@@ -135,7 +135,7 @@ class AccuracyParameters(NamedTuple):
 
 
 class AccuracySums(NamedTuple):
-    """Where the sums go: fields and shapes are those of `Accuracy`."""
+    """The arrays that sums are added to: fields and shapes are those of `Accuracy`."""
 
     error_m: NDArray[np.float32]
     gospa: NDArray[np.float32]
@@ -148,14 +148,14 @@ class AccuracySums(NamedTuple):
 
 
 class EpisodeStates(NamedTuple):
-    """What is carried from list to list. All (S, M)."""
+    """The state of each episode that carries over from list to list. All (S, M)."""
 
     last_track: Int  # the track of the object's last pair, −1: none
     unknown_since_s: Float  # NaN: known
 
 
 class ListScratch(NamedTuple):
-    """The objects whose stay includes the list at hand, and their matches in the run at hand."""
+    """Scratch for one list: the objects whose stay includes it, and their matches in the current run."""
 
     episode: Int
     row: Int  # of the truth, −1: it has a gap there
@@ -167,7 +167,7 @@ class ListScratch(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """The objects that are looked at now: the truth of GOSPA; and its division among them."""
+    """The true objects of the current list that GOSPA counts, and what the division of GOSPA among them gives."""
 
     episode: Int
     column: Int  # of this list in the arrays list by list
@@ -180,7 +180,7 @@ class Targets(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The entries of the list at hand that GOSPA counts."""
+    """The entries of the current list that GOSPA counts."""
 
     x_m: Float
     y_m: Float
@@ -188,19 +188,19 @@ class Estimates(NamedTuple):
 
 
 def make_targets(most: int) -> Targets:
-    """Room for so many objects."""
+    """Targets with room for `most` objects."""
     whole, real = np.empty((3, most), dtype=np.int64), np.empty((5, most))
     return Targets(whole[0], whole[1], real[0], real[1], whole[2], real[2], real[3], real[4])
 
 
 def make_estimates(lists: ObjectLists) -> Estimates:
-    """Room for the entries of any of the lists."""
+    """Estimates with room for the entries of the longest list."""
     x_m, y_m = np.empty((2, lists.longest))
     return Estimates(x_m, y_m, np.empty(lists.longest, dtype=bool))
 
 
 def make_list_scratch(most: int) -> ListScratch:
-    """Room for so many objects."""
+    """Scratch with room for `most` objects."""
     episode, row, distance_band, pair, match, target = np.empty((6, most), dtype=np.int64)
     return ListScratch(episode, row, distance_band, pair, match, target, np.full(most, -1))
 
@@ -465,7 +465,7 @@ def divide_gospa(
 ) -> tuple[float, int]:
     """Divide GOSPAᵖ among `n_true` objects, one at least, given `count` entries.
 
-    Out: `targets.located`, `missed` and `false`. Gives Σ dᵖ over the pairs, and how many they are.
+    Out: `targets.located`, `missed` and `false`. Returns Σ dᵖ over the pairs and their number.
     """
     unit = cutoff_m**power
     localisation, pairs = gospa_pairs(
@@ -492,7 +492,7 @@ def divide_gospa(
 
 @borrowing
 def find_nearest_target(x_m: float, y_m: float, targets: Targets, wanted: int) -> int:
-    """The target nearest to a place, of equally near ones the first; −1: there are none."""
+    """Index of the target nearest to a place, the first of equally near ones; −1: there are none."""
     best, least = -1, np.inf
     for t in range(wanted):
         square = (targets.x_m[t] - x_m) ** 2 + (targets.y_m[t] - y_m) ** 2

@@ -189,9 +189,7 @@ def _is_hit(
 
 @borrowing
 def _distance(x: float, y: float, yaw: float, size: Float, state: Float, after_s: float, radii: float) -> float:
-    """Distance of the ego's box at a pose from the entry's after some time; inf where centres are farther than `radii`
-    from each other.
-    """
+    """Distance of the ego's box from the entry's after some time; inf where centres are `radii` apart or more."""
     ex, ey = state[X] + state[VX] * after_s, state[Y] + state[VY] * after_s
     if (ex - x) ** 2 + (ey - y) ** 2 > radii * radii:
         return np.inf

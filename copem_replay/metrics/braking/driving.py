@@ -27,9 +27,9 @@ JUDGED_DRIVING = RATE, SHARE = "needless_brakes_per_h", "needless_brake_share"
 
 @dataclass(frozen=True)
 class Drives:
-    """Driving and needless braking of one configuration, of K drives; or of the runs of one, if `over` says so.
+    """Driving and needless braking of one configuration in K drives, or in K runs of one drive (`over`).
 
-    `brakes`: mean over runs of how often. `over`: what limits are over; None: of two logs there are none.
+    `brakes`: how many, the mean over runs. `over`: what limits are over; None: of two logs there are none.
     """
 
     hours: Float
@@ -65,7 +65,7 @@ class Drives:
         return limit_left_out(value, without, self.hours, (0.0, 1.0), confidence, unseen, runs)
 
     def limit(self, metric: str, confidence: float) -> LimitedFigure:
-        """The limits of `RATE` or `SHARE`."""
+        """`limit_rate` or `limit_share`, by the name of the figure: `RATE` or `SHARE`."""
         return self.limit_rate(confidence) if metric == RATE else self.limit_share(confidence)
 
 

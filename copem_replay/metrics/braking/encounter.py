@@ -40,7 +40,7 @@ REVERSAL_M = 2.0
 
 @dataclass(frozen=True)
 class Course:
-    """The ego that does not brake, at T instants.
+    """The course of the ego that does not brake, at T instants.
 
     `along_m (T,)`: way from the first vertex of the path, NaN where the ego is not in the log. `bound_m (T,)`: that way
     with gaps closed, and beyond the ego's last frame, `until_s`, with its last speed; the ego is never farther.
@@ -86,7 +86,7 @@ class EgoPath:
         return Course(np.where(present, bound, np.nan), bound, speed, last_s + SAME_INSTANT_S)
 
     def locate(self, along_m: Float) -> tuple[Float, Float]:
-        """Places (K,) so far along the path, straight on beyond its ends."""
+        """Places (K,) at these distances along the path; beyond its ends it goes straight on."""
         path = self.path
         k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
         f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])

@@ -113,12 +113,12 @@ def _add_up_driving(braking: BrakingEgo, max_gap_s: float) -> Float:
 
 @dataclass(frozen=True)
 class NeedlessBraking:
-    """Needless braking of a configuration in S runs, seconds and m/s.
+    """Needless braking of a configuration in S runs, in seconds and m/s.
 
-    `brakes`, `needless_s`, `speed_lost_mps` (the most), `missed_s (S,)`: must brake by the truth, and does not.
-    `needless_s_at (S, T)`: with entries of at least each existence alone. The others are of events (E,), by run and
-    begin: `entries`: by which they are, `class_ix`: the most probable classes of these, `object_id`: of the true
-    objects that they are about, None: none.
+    Per run (S,): `brakes`, the number of events; `needless_s`; `speed_lost_mps`, the most; `missed_s`: the truth
+    demands braking and the driver does not. `needless_s_at (S, T)`: `needless_s` of only the entries of at least each
+    existence. Per event (E,), by run and begin: `entries` that cause it, `class_ix`: their most probable classes,
+    `object_id`: the true objects that they match, None: none.
     """
 
     driving_s: float
@@ -138,7 +138,7 @@ class NeedlessBraking:
     object_id: np.ndarray
 
     def repeated(self, runs: int) -> NeedlessBraking:
-        """Of `runs` runs, each as the one run that stands for all."""
+        """The braking of `runs` equal runs, from that of one."""
         if len(self.brakes) == runs:
             return self
         per_run = {
@@ -175,7 +175,7 @@ class NeedlessDetector:
         self._parts: list[tuple[Int, Int, Entries, Int, Int, Int]] = []
 
     def add(self, lists: ObjectLists, matches: Matches, tells_of: TellsOf) -> None:
-        """Add the lists of a time chunk, and what their entries are about at the instant that they tell of."""
+        """Add the lists of a time chunk, with the matches of their entries at the instant that they tell of."""
         self._tells_of = tells_of
         braking, settings = self._truth.braking, self._truth.asked
         count = lists.start.shape[1] - 1

@@ -196,9 +196,7 @@ def _probability_between(between_s: Float, known_s: Float, reaction: Reaction) -
 
 
 def _reaction_tails(reaction: Reaction, delay_s: Float) -> tuple[Float, Float, bool]:
-    """Probabilities (K,) that a reaction takes at most, and longer than, `delay_s (K,)`; whether both are exact far
-    out.
-    """
+    """Probabilities (K,) of a reaction of at most, and longer than, `delay_s (K,)`; whether both are exact far out."""
     within = np.where(delay_s > 0, 1.0, 0.0)
     possible = np.isfinite(delay_s) & (delay_s >= 0)
     possible_s = delay_s[possible]
