@@ -410,7 +410,7 @@ INVERSE, SPLIT_BY_SHARE, SPLIT_BY_VARIANCE, CROSS = 0, 1, 2, 3
 
 @kernel
 def combine_members(clusters: EntryClusters, method: int, setting: float, by_determinant: bool, fused: Entries) -> None:
-    """Writes positions and covariances of the clusters, in place; one entry alone stays as it is.
+    """Write the combined positions and covariances of clusters, in place; a single member stays as it is.
 
     `setting`: the dependent share, the dependent variance in m², or the correlation, as the method asks.
     """

@@ -39,7 +39,7 @@ Points = NDArray[Any]
 
 
 class EntryClusters(NamedTuple):
-    """The entries of each cluster of each instant, in one run."""
+    """The clusters of each instant in one run, each with its entries."""
 
     start: Int  # (K + 1,) where the clusters of each instant begin
     begin: Int  # (clusters + 1,) where the members of each begin
@@ -240,7 +240,7 @@ def _find_allowed_pairs(
 
 @callee
 def join_entry(cluster: Any, entry: Any, informed: bool) -> None:
-    """Takes an entry into a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
+    """Add an entry to a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
 
     α = β = 1, or in proportion to 1/tr A, 1/tr B with sum 1.
     """
@@ -304,7 +304,7 @@ def _lengthen_entries(entries: Entries, used: int, needed: int) -> Entries:
 def write_entry(
     out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, arrives_s: Float
 ) -> None:
-    """Writes the fused entry of one cluster, its position that of the running state."""
+    """Write the fused entry of a cluster, with the position of its running state."""
     out.x_m, out.y_m = state.x_m, state.y_m
     out.cov_ee_m2, out.cov_en_m2, out.cov_nn_m2 = state.ee, state.en, state.nn
     total = sin = cos = z = vx = vy = length = width = height = 0.0

@@ -127,7 +127,7 @@ class BesideNewest(NamedTuple):
 
 
 def find_lists_beside_newest(received: Tracks, instants: FusionSchedule, cached: KeptEntries | None) -> BesideNewest:
-    """The lists beside the newest ones at `instants`, without those of partial messages, which `cached` holds."""
+    """The lists beside the newest ones at `instants`, without partial messages: `cached` holds those."""
     instant, frame = instants.beside_newest()
     if cached is not None:
         complete = ~cached.partial[received.frame_unit_ix[frame]]
@@ -215,7 +215,7 @@ def _inverse_covariances(received: Tracks) -> tuple[Float, Float, Float]:
 
 
 def floor_covariances(received: Tracks) -> tuple[Float, Float, Float]:
-    """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue too small: see `floor_eigenvalues`."""
+    """Stated position covariances ee, en, nn (1 | S, P) with small eigenvalues raised: see `floor_eigenvalues`."""
     cov = _stated_covariances(received)
     high, low, c2, s2 = _covariance_axes(*cov)
     mean, difference = (high + low) / 2, (high - low) / 2
@@ -250,7 +250,7 @@ _WEIGHED_BY = {
 
 
 class WeightedRows(NamedTuple):
-    """Values of rows (P,) and their weights, whichever rows are listed."""
+    """Values and weights of rows (P,), listed or not."""
 
     covariances: tuple[Float, Float, Float]
     information: PositionInformation

@@ -57,7 +57,7 @@ def make_inputs(
     instants: FusionSchedule | None = None,
     captured_s: Float | None = None,
 ) -> Inputs:
-    """Lists as the input of a fusion: when the receiver of a configuration has each, and which it uses when.
+    """The input of a fusion: lists with the instants at which the receiver of a configuration has and uses each.
 
     `instants`: some of its instants; None: all. `captured_s (F,)`: the captures that fusion is told; None: the true
     ones.
@@ -71,7 +71,7 @@ def make_inputs(
 
 
 def add_kept_entries(inputs: Inputs, cached: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
-    """The input in one run, with the entries that the receiver keeps of units with partial messages, for `max_age_s`.
+    """The input in one run, plus the entries that the receiver caches of units with partial messages, for `max_age_s`.
 
     `partial (U,)`: those units.
     """

@@ -37,7 +37,7 @@ from copem_replay.fusion.interface import (
 def needed_lists(
     captured_s: Float, instants: FusionSchedule | Inputs, first: int, after: int, looks_back_s: float
 ) -> Bool:
-    """(F,) lists whose entries are needed at the instants `first` … `after` − 1; `captured_s (F,)`: their captures.
+    """Mask (F,) of the lists that the instants `first` … `after` − 1 need; `captured_s (F,)`: their captures.
 
     The units' newest, those that arrive, and, where `ListFusion.looks_back_s` is not 0, those that have arrived before
     and were captured at most so long before the newest of them.
@@ -58,7 +58,7 @@ def needed_lists(
 
 
 def cut_chunk(inputs: Inputs, first: int, after: int, looks_back_s: float) -> Inputs:
-    """The input at the instants `first` … `after` − 1, with the entries of the lists alone that they need."""
+    """The input at the instants `first` … `after` − 1, with only the entries of needed lists."""
     needed = needed_lists(inputs.captured_s, inputs, first, after, looks_back_s)
     start, entries = inputs.lists.start, inputs.lists.entries
     lengths = np.where(needed, np.diff(start), 0)
@@ -108,7 +108,7 @@ _SCENES: tuple[tuple[str, int, int, float, int, float, float], ...] = (
 
 @dataclass(frozen=True)
 class SmallScene:
-    """The lists of units: `said[s][f]` are the entries of list f in run `runs[s]`."""
+    """The lists of units: `said[s][f]` has the entries of list f in run `runs[s]`."""
 
     name: str
     units: tuple[str, ...]
@@ -137,7 +137,7 @@ class SmallScene:
         return make_inputs(received, ObjectLists(start, entries), max_age_s=1.0)
 
     def of_runs(self, runs: Sequence[int]) -> SmallScene:
-        """The scene with the runs `runs`, in this order."""
+        """The scene in the runs `runs`, in this order."""
         return replace(self, runs=runs, said=tuple(self.said[s] for s in runs))
 
     def of_lists(self, lists: Int) -> SmallScene:
@@ -152,7 +152,7 @@ class SmallScene:
         return replace(scene, units=tuple(self.units[u] for u in order), unit_ix=place[scene.unit_ix])
 
     def beside(self, unit: str) -> SmallScene:
-        """The scene with one more unit, of which nothing arrives."""
+        """The scene with one more unit, from which no list arrives."""
         count = len(self.unit_ix)
         scene = self.of_lists(np.tile(np.arange(count), 2))
         scene.unit_ix[count:], scene.arrives_s[count:] = len(self.units), np.inf

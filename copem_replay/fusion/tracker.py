@@ -85,7 +85,7 @@ class Tracker(ListFusion):
 
     @property
     def looks_back_s(self) -> float:
-        """How far back (s) lists are received again."""
+        """Seconds for which earlier lists are received again."""
         return self.buffer_s if self.late == "replay" else 0.0
 
     def fuse(self, inputs: Inputs) -> ObjectLists:

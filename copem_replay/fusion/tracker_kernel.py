@@ -49,7 +49,7 @@ No claim yet: 0, −inf."""
 
 
 class TrackerMemory(NamedTuple):
-    """Memory from one instant to the next; tracks stand in the order in which they were founded."""
+    """The tracker's state from one instant to the next; tracks stand in the order in which they were founded."""
 
     tracks: NDArray[Any]  # (T,) of TRACK
     claims: NDArray[Any]  # (T, U) of CLAIM
@@ -57,7 +57,7 @@ class TrackerMemory(NamedTuple):
 
 
 class StoredMemory(NamedTuple):
-    """Memory from one time chunk of instants to the next; all but `memory` is for `late: replay` alone.
+    """The tracker's state from one time chunk to the next; all but `memory` serves `late: replay` alone.
 
     Lists captured at one instant have one memory before them. These are stored instant after instant: of instant b the
     next `sizes[b]` of `tracks` and `claims`, and the square of that of `together_s`.
@@ -80,7 +80,7 @@ def empty_memory(units: int) -> StoredMemory:
 
 @callee
 def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
-    """A copy of the memory, the memory before each of the lists received of late, and these lists."""
+    """A copy of the state, the state before each of the recently received lists, and these lists."""
     memory = _copy_memory(so_far.memory)
     before = [memory]
     before.pop()
@@ -100,7 +100,7 @@ def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemor
 
 @callee
 def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: Int, captured_s: Float) -> StoredMemory:
-    """What `recall_memory` gives, in the form in which it is stored."""
+    """The result of `recall_memory` in the form in which it is stored."""
     first = np.empty(len(received), np.int64)
     instants = tracks = pairs = 0
     for h in range(len(received)):
@@ -140,7 +140,7 @@ def _copy_memory(memory: TrackerMemory) -> TrackerMemory:
 
 @callee
 def propagate_covariance(P: Float, dt_s: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: P ← F P Fᵀ, in place, without acceleration."""
+    """Advance a covariance by `dt_s` ≥ 0 without acceleration: P ← F P Fᵀ, in place."""
     for i in range(2):
         for j in range(2):
             P[i, j] += dt_s * (P[i, 2 + j] + P[2 + i, j]) + dt_s * dt_s * P[2 + i, 2 + j]
@@ -152,7 +152,7 @@ def propagate_covariance(P: Float, dt_s: float) -> None:
 
 @callee
 def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
+    """Advance a state by `dt_s` ≥ 0: x ← F x, P ← F P Fᵀ + Q."""
     for i in range(2):
         state[i] += dt_s * state[2 + i]
     propagate_covariance(P, dt_s)
@@ -165,7 +165,7 @@ def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
 
 @callee
 def update_state(state: Float, P: Float, x_m: float, y_m: float, ee: float, en: float, nn: float) -> None:
-    """Takes in a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
+    """Update a state by a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
     a, b, d = P[0, 0] + ee, P[0, 1] + en, P[1, 1] + nn
     det = a * d - b * b
     k_x = _gain_column(P, d / det, -b / det)
@@ -231,7 +231,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 @callee
 def update_split(state: Float, P: Float, common: Float, z: Float, share: float, grown: float) -> None:
-    """Takes in a measured position, in place. `z`: x, y, ee, en, nn; the independent part of R counts `grown` times.
+    """Update a state by a position, in place. `z`: x, y, ee, en, nn; the independent part of R counts `grown` times.
 
     `grown`: from 1 to infinity, where the measurement tells nothing new but its common part.
     """
@@ -341,7 +341,7 @@ class HeardLists(NamedTuple):
 
 
 class TrackerRules(NamedTuple):
-    """The settings of the tracker, in the form that the kernel takes."""
+    """The settings of the tracker as numbers and arrays for the kernel."""
 
     late: int
     q_m2ps3: float
@@ -363,7 +363,7 @@ class TrackerRules(NamedTuple):
 def track_run(
     unit_lists: HeardLists, rules: TrackerRules, so_far: StoredMemory, issue_s: Float, arrived: Int, arrived_start: Int
 ) -> tuple[Int, Entries, StoredMemory]:
-    """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and what to remember."""
+    """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and the next state."""
     memory, before, received = recall_memory(so_far, unit_lists.captured_s)
     start, entries = np.zeros(len(issue_s) + 1, np.int64), np.zeros(256, ENTRY)
     for k in range(len(issue_s)):
@@ -417,12 +417,10 @@ def _replay_memory(
         memory = _hear_list(memory, unit_lists, rules, replayed[k], now_s)
         if k + 1 == len(replayed) or unit_lists.captured_s[replayed[k + 1]] > now_s:
             memory = _settle_tracks(memory, rules, now_s)
-    stale = 0
-    while (
-        unit_lists.captured_s[received[stale]] < unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S
-    ):
-        stale += 1
-    return memory, before[stale:], received[stale:]
+    skip = 0
+    while unit_lists.captured_s[received[skip]] < unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S:
+        skip += 1
+    return memory, before[skip:], received[skip:]
 
 
 @callee
