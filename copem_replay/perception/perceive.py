@@ -189,7 +189,7 @@ class EntryClaims(NamedTuple):
     track_id: Int  # (P,)
 
     def followed_by(self, others: EntryClaims) -> EntryClaims:
-        """The claims of these rows and then of the others."""
+        """The claims of these rows, then those of other rows."""
         columns: Any = map(np.concatenate, zip(self, others, strict=True))
         return EntryClaims(*columns)
 
@@ -392,7 +392,7 @@ def remove_outages(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: I
 
 
 def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:
-    """(S, F) lists of `tracks` that are not made in the runs (S,), as their unit is down; None: all are made."""
+    """(S, F) lists of `tracks` that are missing in the runs (S,), as their unit is down; None: all are made."""
     outages_by_unit = {
         name: unit.outages for name, unit in setup.units.items() if unit.outages is not None and name in tracks.units
     }

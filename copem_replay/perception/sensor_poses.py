@@ -112,7 +112,7 @@ def offset_places(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[fl
 
 
 def make_observers(places: Sequence[UnitPoses], carriers: Int) -> Observers:
-    """Units at the lists of one world, as visibility takes them; `carriers (U,)`: object indices, −1: none."""
+    """Units at the lists of one world, in the form that visibility takes; `carriers (U,)`: object indices, −1: none."""
     return Observers(
         np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),
         np.stack([p.present for p in places]),
@@ -203,7 +203,7 @@ def _make_solid(truth: Tracks, k: int, obstacle: Obstacle, far_m: dict[str, floa
 
 
 def make_solid_statics(solids: Sequence[Solid]) -> Statics:
-    """Solids as visibility takes them."""
+    """Solids in the form that visibility takes."""
     if not solids:
         return NO_STATICS
     bottoms_m, heights_m = zip(*((solid.bottom_m, solid.height_m) for solid in solids), strict=True)
@@ -219,7 +219,7 @@ def _hides_from_m(solid: Solid) -> float:
 def find_enclosing_solid(
     scene: Scene, truth: Tracks, unit: Placement, obstacles: tuple[Obstacle, ...]
 ) -> tuple[Solid, float] | None:
-    """The solid that a fixed unit is in, and its distance (m) from the nearest face; None: it is in none."""
+    """The solid around a fixed unit, and the unit's distance (m) from the nearest face; None: it is in none."""
     import shapely
 
     if unit.at is None or unit.height_m is None:

@@ -247,7 +247,7 @@ def visible_shares(
 
 
 def find_blockers(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Int:
-    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
+    """The body that alone hides most of each row of the world from each unit: (U, P), a row of the world.
 
     −1: none hides any of it; −2 − k: the obstacle k. Raises InputError where a model of the user's own fails.
     """

@@ -76,7 +76,7 @@ def ask_errors(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, w
 
 
 def find_noise_names(model: ErrorModel) -> frozenset[str] | None:
-    """The names by which a model asks for noise, when it is asked about no rows; None where it fails at that."""
+    """The names of the noise that a model requests, tried with no rows; None where the model fails at that."""
     names: set[str] = set()
 
     def noise(name: str) -> Float:
