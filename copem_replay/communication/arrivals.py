@@ -31,7 +31,7 @@ class FusionSchedule:
     arrived_start: Int
 
     def beside_newest(self) -> tuple[Int, Int]:
-        """Lists that arrive at an instant without being their unit's newest there: their instants and themselves, (B,).
+        """The lists (B,) that are not their unit's newest at the instant they arrive: their instants, and the lists.
 
         They arrive together with a newer one of their unit, or after it. Each list arrives once.
         """
@@ -118,7 +118,7 @@ def first_newer_arrival_s(arriving: Tracks) -> Float:
 
 @dataclass(frozen=True)
 class KeptEntries:
-    """The entries that the receiver keeps of units with partial messages, as lists (L,) beside those that are sent.
+    """The entries that the receiver caches of units with partial messages, as lists (L,) beside those that are sent.
 
     List l has the entries `entry[start[l] : start[l + 1]]`, each as it was sent, in messages of the unit up to `frame`.
     `newest (K, U)`: as in FusionSchedule, and F + l for list l, with F lists sent. `partial (U,)`: the units.

@@ -29,7 +29,7 @@ LINKS = {"radio": "copem_replay.communication.radio:Radio"}
 
 
 class KeptDraws:
-    """What links drew for the lists of one log, run by run.
+    """Cache of the numbers that links drew for the lists of one log, run by run.
 
     Several configurations send by a link, and the columns about links use its draws again. When there is no more room
     all is forgotten, and drawn again where it is needed.
@@ -40,7 +40,7 @@ class KeptDraws:
         self._kept: dict[Hashable, list[tuple[LinkModel, tuple[Float, Bool]]]] = {}
 
     def of(self, link: LinkModel, lists: Hashable, drawn: Callable[[], tuple[Float, Bool]]) -> tuple[Float, Bool]:
-        """What a link drew for some lists of one run; the result of `drawn`, the first time."""
+        """The cached draws of a link for some lists of one run; the result of `drawn` the first time."""
         for other, draws in tuple(self._kept.get(lists, ())):
             if other == link:
                 return draws
@@ -55,7 +55,7 @@ class KeptDraws:
 
 @dataclass(frozen=True)
 class LinkInput:
-    """Further input of a link for lists (F,) in one run: random numbers, paths, and how many entries each list has.
+    """Inputs of a link for lists (F,) in one run: random numbers, paths, and the number of entries of each list.
 
     `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """
@@ -130,7 +130,7 @@ class ConstantLink(LinkModel):
 
 @dataclass(frozen=True)
 class UnitLinks:
-    """A link of a configuration, the units that send by it (None: all), and `where` in the experiment it stands."""
+    """A link of a configuration, the units that send by it (None: all), and `where` the experiment names it."""
 
     where: str
     link: LinkModel
@@ -139,7 +139,7 @@ class UnitLinks:
 
 @dataclass(frozen=True)
 class Delays:
-    """The delays `by_run_s (1, F)` that a link gives F lists, checked. Raises GivenError where they are no delays."""
+    """The checked delays `by_run_s (1, F)` that a link gives F lists. Raises GivenError where they are none."""
 
     by_run_s: Float
     lists: int

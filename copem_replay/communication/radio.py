@@ -37,7 +37,7 @@ class RadioChannel(Frozen):
     object_bytes: Annotated[int, Field(strict=True, ge=0, le=10**9)] = 35
 
     def takes_s(self, objects: Int) -> Float:
-        """(K,) how long lists of so many objects are in the air."""
+        """(K,) seconds in the air of lists of so many objects."""
         result: Float = 8 * (self.header_bytes + self.object_bytes * objects) / (1000 * self.kbps)
         return result
 
