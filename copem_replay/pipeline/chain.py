@@ -29,10 +29,7 @@ from copem_replay.pipeline.world import Transmission
 
 
 def fuse_members(log: Replay, experiment: Experiment, group: RunGroup, *, entries: bool = True) -> Replay:
-    """The log in the one run of a group, in which the lists of the units that fuse are recorded ones.
-
-    `entries=False`: when there are lists is enough; nothing is fused.
-    """
+    """The log in the one run of a group, with the lists of fusing units as recorded ones; empty without `entries`."""
     units = log.expand(experiment)
     if not units.fusing:
         return log

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 def find_lasting_detection(
     replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks
 ) -> LastingDetection | None:
-    """How the detection of each row (P,) lasts in what a configuration hears; None: no detection lasts.
+    """How the detection of each row (P,) lasts, of all lists that a configuration receives; None: no detection lasts.
 
     Raises ExperimentError where detection lasts in a way that has no closed form.
     """
@@ -151,7 +151,7 @@ def _refuse_lasting(name: str, why: str, log: str = "") -> ExperimentError:
 
 
 def receive_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str, hits: int) -> tuple[Tracks, Float]:
-    """What reaches the receiver of a configuration if no list is lost, and the probability that each (F,) is not.
+    """The lists that reach a configuration's receiver if none is lost, and the probability (F,) that each is not lost.
 
     `hits`: how many confirm an object. Raises ExperimentError where drawn arrivals have no closed form.
     """
@@ -226,7 +226,7 @@ def _refuse_link(name: str, why: str) -> ExperimentError:
 
 
 def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
-    """The rows of `exact.parquet` of one log: per configuration and object, how probable each time of detection is.
+    """The rows of `exact.parquet` of one log: the probability of each time of detection, by configuration and object.
 
     Raises ExperimentError for a configuration that has no closed form.
     """

@@ -37,7 +37,7 @@ LONG_S = 10.0
 
 @dataclass
 class RunCost:
-    """Seconds of a run: all of it, and what its workers did, of which some was measuring accuracy.
+    """Seconds of a run: of all of it, of its workers, and of these what measured accuracy.
 
     `compiled`: kernels had to be compiled, so the next run takes less.
     """
@@ -61,7 +61,7 @@ class RunCost:
         )
 
     def add(self, in_blocks_s: float, outcomes: Sequence[BlockOutcome]) -> None:
-        """Take in blocks that were computed within `in_blocks_s` seconds."""
+        """Add the seconds of blocks that were computed within `in_blocks_s`."""
         self.in_blocks_s += in_blocks_s
         self.worked_s += sum(outcome.worked_s for outcome in outcomes)
         self.accuracy_s += sum(outcome.accuracy_s for outcome in outcomes)
@@ -92,7 +92,7 @@ Size: TypeAlias = tuple[int, int]
 
 
 def estimate_size(replay: Replay) -> Size:
-    """The rows that one run of a log gives, and how often units look at measured objects."""
+    """Estimated rows of one run of a log, and how often units look at measured objects."""
     experiment, measured = replay.expanded, replay.episodes.object_ix
     states = int(np.diff(replay.truth.start)[np.isin(replay.truth.object_ix, measured)].sum())
     return len(measured) * len(experiment.configurations), states * len(experiment.modelled)
@@ -147,7 +147,7 @@ def _free_process_bytes() -> int | None:
 
 
 def peak_bytes() -> int | None:
-    """The most memory that this process had at a time; None: the system does not say."""
+    """The peak memory of this process; None: the system does not say."""
     if resource is None:
         peak_wset: int | None = getattr(psutil.Process().memory_info(), "peak_wset", None)  # Windows
         return peak_wset

@@ -33,7 +33,7 @@ from copem_replay.perception.config import Carriers
 
 @dataclass(frozen=True)
 class ConfigurationFacts:
-    """What a configuration is, as `provenance.json` has it.
+    """The properties of a configuration, as `provenance.json` states them.
 
     `truth`: its lists are the truth; `recorded`: they are the output of a stack. `by_truth_id`: objects are detected by
     truth id, not by match. `fixed`: detections are equal in every run; `fixed_verdicts`: and whether the ego passes.
@@ -55,7 +55,7 @@ class ConfigurationFacts:
 
 
 def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
-    """What each configuration of an experiment is, by name.
+    """The properties of each configuration of an experiment, by name.
 
     Fixed by kind of unit: lists of the truth and of recorded units are not drawn; those of a unit with a PEM are, and
     so are its carriers, even where probabilities are 0 or 1. A driver's delay is drawn, except with the `constant`
@@ -174,12 +174,12 @@ class ExpandedExperiment(Experiment):
 
     @property
     def ready(self) -> dict[str, LatencyModel]:
-        """By unit the time from capture until a list can be sent, of those that state one."""
+        """Seconds from capture until a list can be sent, by unit that states a model of it."""
         return {name: unit.ready for name, unit in self.units.items() if unit.ready is not None}
 
     @property
     def sends(self) -> dict[str, Sends]:
-        """By unit the rules of what it sends, of those that do not send all of their lists."""
+        """The sending rules by unit, for units that do not send all of their lists."""
         return {name: unit.sends for name, unit in self.units.items() if unit.sends is not None}
 
     @property
@@ -192,17 +192,17 @@ class ExpandedExperiment(Experiment):
         return self.unit_links[name]
 
     def has_way(self, name: str) -> bool:
-        """Whether the way of a configuration's lists is measured, in the study."""
+        """Whether the study measures the way of a configuration's lists."""
         return name in self.ways
 
     def linked(self, name: str) -> list[str]:
-        """The units that send by a link in one of these configurations; TRUTH stands for the truth."""
+        """The units that send by a link in any of these configurations; TRUTH stands for the truth."""
         configuration = self.configurations[name]
         return [unit for unit in self.units_of(configuration) or (TRUTH,) if configuration.link_of(unit) is not None]
 
     @property
     def arrivals_differ(self) -> bool:
-        """Whether lists, or their arrivals, differ from run to run: each run then has receiver instants of its own."""
+        """Whether lists or their arrivals differ between runs: each run then has receiver instants of its own."""
         return (
             self.outages
             or bool(self.sends or self.fusing)
@@ -212,7 +212,7 @@ class ExpandedExperiment(Experiment):
 
     @property
     def runs_apart(self) -> bool:
-        """Whether runs are replayed one by one, as lists differ in more than the presence and states of their rows."""
+        """Whether runs are replayed one by one, as their lists differ in more than presence and states of rows."""
         return self.arrivals_differ or any(
             unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
             for configuration in self.configurations.values()
@@ -283,8 +283,8 @@ def _expand_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment
 
 
 def expand_alike(experiment: Experiment, other: ExpandedExperiment) -> ExpandedExperiment:
-    """An experiment with the units of another over one log, from which it differs in its configurations or in what is
-    measured. Raises ValueError where it has other units.
+    """An experiment with the units of another over one log; the two differ in configurations or in what is measured.
+    Raises ValueError where the units differ.
     """
     if isinstance(experiment, ExpandedExperiment):
         return experiment
@@ -316,7 +316,7 @@ def _replace_units(
 
 
 def expand_members(experiment: ExpandedExperiment) -> ExpandedExperiment:
-    """The experiment in which each unit that fuses is a configuration of its members, and no unit."""
+    """The experiment with the members of each fusing unit as a configuration, and without that unit."""
     keep = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
     names = list(experiment.units)
     given = {name: getattr(experiment, name) for name in Experiment.model_fields}
@@ -335,7 +335,7 @@ def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput)
 
 
 def resolve_for_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
-    """The experiment in one run: with the units that objects carry in this run."""
+    """The experiment in one run, with only the units that objects carry in it."""
     expanded = _expand_carriers(experiment, scene)  # `prepare_log` adds the outputs
     equipped = expanded.equipped(scene.log, np.array([run]))
     if equipped is None and expanded.units.keys() == experiment.units.keys():
@@ -390,7 +390,7 @@ class RunGroup:
 
 
 def group_runs(experiment: ExpandedExperiment, log: str, runs: Int, *, entries_alone: bool = False) -> list[RunGroup]:
-    """The runs (S,) in groups that have the same lists. `entries_alone`: only the entries of lists count."""
+    """The runs (S,) grouped by equal lists. `entries_alone`: only the entries of lists count."""
     everyone = RunGroup.of_all_units(experiment, runs)
     equipped = experiment.equipped(log, runs)
     if entries_alone and not experiment.arrivals_differ:

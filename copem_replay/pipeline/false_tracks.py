@@ -44,7 +44,7 @@ class FalseTracks:
         self._added = self._of_runs = 0
 
     def add(self, lists: ObjectLists, matches: Matches, now: Matches) -> None:
-        """Add the next lists, and what their entries are about at the instant that they tell of, and now."""
+        """Add the next lists, with the matches of their entries at the instant they tell of, and now."""
         false = (matches.role == GHOST) & (now.role == GHOST)
         rows = np.flatnonzero(false & self._measured_class[matches.class_ix])
         place = np.searchsorted(lists.start.ravel(), rows, side="right") - 1
@@ -119,7 +119,7 @@ LISTED = 5
 
 
 def describe_false_tracks(rows: pd.DataFrame) -> str:
-    """In words the false tracks of a configuration in one run, the longest first, `LISTED` at most; `none`."""
+    """The false tracks of a configuration in one run in words, the longest first, at most `LISTED`; `none`."""
     import pandas as pd
 
     ranked = rows.iloc[np.lexsort((rows["begins_s"], -rows["lasts_s"].round(6)))]  # rounding decides nothing

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ListRate:
-    """The fused lists of one configuration: intervals between them, the seconds these cover, and what its links do."""
+    """The fused lists of one configuration: number of intervals, the seconds these cover, and what its links do."""
 
     intervals: int
     covered_s: float
@@ -255,7 +255,7 @@ def _find_unused_memory(experiment: Experiment) -> Iterator[str]:
 
 
 def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
-    """What is odd about a log in an experiment, a line each.
+    """The oddities of a log in an experiment, one line each.
 
     `met (U,)`: whether an object ever meets a condition of each modelled unit's PEM; None: judged by range, azimuth and
     class alone.
@@ -370,7 +370,7 @@ def _find_missing_hosts(replay: Replay, experiment: Experiment) -> Iterator[str]
 
 
 def could_meet(replay: Replay) -> Bool:
-    """(U,) whether an object ever has range, azimuth and class of a condition of each modelled unit's PEM.
+    """(U,) whether any object ever has range, azimuth and class of a condition of each modelled unit's PEM.
 
     Visibility is left out: where no condition is met here, no replay meets one.
     """
@@ -508,7 +508,7 @@ RANGES_M = (30.0, 40.0, 50.0)
 
 
 def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
-    """Lines of `check`: how many objects of all logs begin how, with `in_range` at each of `RANGES_M`."""
+    """Lines of `check`: how many objects of all logs begin in each way, with `in_range` at each of `RANGES_M`."""
     onset = experiment.measure.onset
     onsets: dict[str, Onset] = {f"within {range_m:g} m": InRange(range_m=range_m) for range_m in RANGES_M}
     if not isinstance(onset, InRange):
@@ -545,7 +545,7 @@ def _describe_counted(numbers: Sequence[int], words: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What results say of one log in one experiment beside its rows. `times`: as `measure_list_rates` gives them.
+    """The facts of one log in one experiment that results state beside its rows. `times`: as of `measure_list_rates`.
 
     `episodes`: rows of a run and configuration; `began`: how many began in each of the ways `BEGAN`. `same_instants`:
     whether all runs have the same units, and lists at the same instants. `listable`: observation rows, by which the
@@ -603,7 +603,7 @@ def scene_as_json(scene: Scene) -> dict[str, Any]:
 
 
 def scene_from_json(data: dict[str, Any]) -> Scene:
-    """The scene of plain data that `scene_as_json` gave."""
+    """The scene from the plain data of `scene_as_json`."""
     return Scene(
         **data
         | {

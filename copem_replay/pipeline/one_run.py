@@ -56,7 +56,7 @@ class RunTracks:
             yield chunk.fused
 
     def chunks(self) -> Iterator[RunChunk]:
-        """The fused tracks, and the lists of the units that they are made of."""
+        """Pairs of the fused tracks of a time chunk and the unit lists that they are made of."""
         if len(self.replay.chunks) == 1:
             yield self._all
         else:
@@ -100,14 +100,14 @@ class RunTracks:
 
 
 class RunChunk(NamedTuple):
-    """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
+    """The fused tracks of a run in one time chunk, by configuration, and the source of its units' lists."""
 
     fused: dict[str, FusedTracks]
     unit_lists: Callable[[], list[ReadyLists]]
 
 
 def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[ReadyLists]:
-    """What units that are not recorded have ready to send in a time chunk of one run, as fusions get it.
+    """The lists that modelled units have ready to send in a time chunk of one run, in the form that fusions get.
 
     `arriving`: by configuration the lists by when they reach its receiver.
     """
@@ -194,7 +194,7 @@ STEM = "replay"
 
 @dataclass(frozen=True)
 class ShownRun:
-    """One run that is shown: its number, why it is selected (empty: asked for by number), its files' stem."""
+    """A run that is shown: its number, the reason (empty: asked for by number), and the stem of its files."""
 
     run: int
     why: str
@@ -246,7 +246,7 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str
 
 
 def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
-    """Those of the names of all logs that are shown."""
+    """The shown logs, out of the names of all."""
     if experiment.show is None or not experiment.show.asked():
         return []
     asked = experiment.show.logs
@@ -257,7 +257,7 @@ def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class ReplayedRun:
-    """The fused tracks of one run of one log, and the replay and experiment with the units there were in it."""
+    """The fused tracks of one run of one log, with the replay and the experiment of the units in that run."""
 
     replay: Replay
     experiment: Experiment
@@ -287,7 +287,7 @@ class Curve:
 
 
 def share_curves(replay: Replay, observations: Observations, object_ix: int) -> dict[str, Curve]:
-    """The curves of an object by name, without those that have no unit. `observations`: its rows, at least."""
+    """The visible-share curves of an object by name, of units that have a list. `observations`: its rows, at least."""
     scene, experiment, tracks = replay.scene, replay.expanded, observations.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([find_carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)

@@ -74,11 +74,11 @@ class FolderStore:
             raise OutputError(f"{_OPTION}{root}: cannot be written: {error.strerror or error}") from error
 
     def exists(self, name: str) -> bool:
-        """Whether there is such a file."""
+        """Whether the file exists."""
         return (self.root / name).is_file()
 
     def read(self, name: str) -> bytes | None:
-        """The content of a file; None: there is none. Raises OSError."""
+        """The content of a file; None: it does not exist. Raises OSError."""
         try:
             return (self.root / name).read_bytes()
         except FileNotFoundError:
@@ -188,7 +188,7 @@ def recipe_key(recipe: str) -> str:
 
 @cache
 def take_fingerprint() -> dict[str, str]:
-    """What numbers depend on beside the recipe: versions of this package and its sources, libraries, Python, libc."""
+    """The versions that numbers depend on beside the recipe: this package and its sources, libraries, Python, libc."""
     package = Path(__file__).parents[1]
     digest = hashlib.blake2b(digest_size=20)
     for path in sorted(package.rglob("*.py")):
@@ -254,7 +254,7 @@ def _list_dependencies(experiment: Experiment, configuration: Configuration) -> 
 
 
 def own_components(*models: BaseModel | None) -> list[Component | MapFile]:
-    """What of models depends on files: the user's own components, recorded latencies, maps."""
+    """The parts of models that come from files: the user's own components, recorded latencies, maps."""
     components = (one for model in models for one in _find_components(model))
     return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency | MapFile)]
 
@@ -292,7 +292,7 @@ shares fewer parts with a longer one, and more memory is needed; no result chang
 
 
 def cut_parts(runs: int, object_states: int) -> list[tuple[int, int]]:
-    """The blocks of runs, from and up to, that are parts: as many each as the log's size says, the last one cut.
+    """The blocks of runs, (from, until), that are parts: of a size that depends on the log's size; the last one is cut.
 
     That many is a power of two: sums of accuracy are a tree over runs. More runs find the parts of fewer.
     """
@@ -325,7 +325,7 @@ class PartCache:
             return None
 
     def write(self, recipe: str, part: PartTables) -> PartTables:
-        """Keep a part; returns it. Raises OutputError."""
+        """Cache a part; returns it. Raises OutputError."""
         self.store.write(part_name(recipe), _seal(pack_part(part, recipe)))
         self.computed += 1
         return self._reread(recipe, part)
@@ -343,7 +343,7 @@ class PartCache:
         return replace(part, again=again) if isinstance(self.store, FolderStore) else part
 
     def known(self, about: str) -> dict[str, Any] | None:
-        """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""
+        """The cached facts of a log under the key `about`; None: missing or damaged."""
         try:
             facts: Any = parse_json(_unseal(self.store.read(_record_name(about)) or b""))
         except (OSError, ValueError):
@@ -351,11 +351,11 @@ class PartCache:
         return facts if isinstance(facts, dict) else None
 
     def keep(self, key: str, facts: Mapping[str, Any]) -> None:
-        """Keep facts of a log under `key`. Raises OutputError."""
+        """Cache facts of a log under `key`. Raises OutputError."""
         self.store.write(_record_name(key), _seal(canonical_json(facts).encode()))
 
     def forget(self, about: str) -> None:
-        """Remove the facts of a log under `about`. Raises OutputError."""
+        """Remove the facts of a log under the key `about`. Raises OutputError."""
         self.store.write(_record_name(about), b"")
 
 

@@ -136,7 +136,7 @@ def _fill_words(
 
 @dataclass(frozen=True)
 class FusedOnce:
-    """What ideal fusion made of lists of the same captures, which configurations with other latencies share."""
+    """The ideal fusion of lists of the same captures, shared by configurations that differ in latency."""
 
     sent: Tracks
     captures: bytes
@@ -148,7 +148,7 @@ class FusedOnce:
         return convert_to_lists(self.fused_tracks, self.fused_tracks.scene)
 
     def lists_arriving(self, received: Tracks) -> ListsWithIds | None:
-        """These as lists, for lists received at other times; None: an entry's first unit may differ.
+        """The fused lists, for inputs that arrive at other times; None: the first unit of an entry may differ.
 
         Which list of two arrived first stays the same where all are later by one latency.
         """
@@ -164,7 +164,7 @@ class FusedOnce:
 
 
 def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> FusedTracks:
-    """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else."""
+    """The lists of one run as tracks, one per matched object, else per identity of the fusion, else per entry."""
     lists, received, issue_s, newest = output.lists, output.received, output.instants.issue_s, output.instants.newest
     first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
     entries = lists.entries[first:last]
@@ -206,7 +206,7 @@ def make_entry_tracks(
 
 @dataclass(frozen=True)
 class StatedCaptures:
-    """Captures of the lists (F,) of one run, as units state them and as they are; seconds since the log's start.
+    """Stated and true captures of the lists (F,) of one run; seconds since the log's start.
 
     `older (3, E)`: the same three of entries that are older than their lists.
     """
@@ -218,12 +218,12 @@ class StatedCaptures:
 
     @cached_property
     def told(self) -> Float:
-        """(3, F + E) what is stated, what is true, and arrivals, of all captures that entries may tell of."""
+        """(3, F + E) stated captures, true captures and arrivals, of all captures that entries may name."""
         return np.concatenate([[self.stated_s, self.captured_s, self.arrives_s], self.older], axis=1)
 
     @property
     def ahead_s(self) -> float:
-        """How far a stated capture is ahead of the true one, at most; 0 where none is."""
+        """The largest lead of a stated capture over the true one; 0 where none is ahead."""
         return float((self.stated_s - self.captured_s).max(initial=0.0))
 
     def captured_between_s(self, stated_s: Float) -> tuple[Float, Float]:
@@ -241,7 +241,7 @@ class StatedCaptures:
         return replace(lists, entries=entries)
 
     def true_lists(self, fused: ObjectLists, issue_s: Float) -> ObjectLists:
-        """Fused lists, one run of K available at `issue_s`, whose entries go back to true captures."""
+        """Fused lists, one run of K available at `issue_s`, with true captures in their entries."""
         entries = fused.entries.copy()
         entries["captured_s"] = self._true_s(entries["captured_s"], np.repeat(issue_s, np.diff(fused.start[0])))
         return replace(fused, entries=entries)
@@ -262,7 +262,7 @@ class StatedCaptures:
 
 
 def state_captures(scene: Scene, received: Tracks, experiment: ExpandedExperiment, run: int) -> StatedCaptures | None:
-    """What a receiver is told of the captures of the lists it hears, none after its arrival; None: the truth."""
+    """The captures that units state to a receiver, none after the list's arrival; None: they state the truth."""
     error_s = clock_errors_s(scene, received.units, experiment, received.captured_s, received.frame_unit_ix, run)
     if error_s is None:
         return None
@@ -302,17 +302,17 @@ class ReceiverOutput:
 
     @cached_property
     def lists(self) -> ObjectLists:
-        """The fused lists without truth ids; their entries go back to true captures."""
+        """The fused lists without truth ids, with true captures in their entries."""
         return self.told if self.stated is None else self.stated.true_lists(self.told, self.instants.issue_s)
 
     @property
     def told(self) -> ObjectLists:
-        """The fused lists without truth ids; their entries have the captures that the fusion was told of."""
+        """The fused lists without truth ids, with the captures that units stated to the fusion."""
         return self._lists_with_ids.lists
 
     @cached_property
     def origins(self) -> Origins:
-        """What the entries of the fused lists go back to."""
+        """The lists that the entries of the fused lists go back to."""
         holdings = self.origin.find_holdings(self.instants.issue_s)
         return Origins(self.lists.entries, self._lists_with_ids.object_ix, holdings)
 
@@ -338,7 +338,7 @@ class ReceiverOutput:
 
 
 def states_needed(configuration: Configuration) -> States | None:
-    """What has to be drawn of units' rows for the fused states of a configuration; None, of the truth: nothing."""
+    """The states that must be drawn for a configuration's fused states; None, for the truth: none."""
     if configuration.units == TRUTH:
         return None
     fusion = configuration.fusion
@@ -346,7 +346,7 @@ def states_needed(configuration: Configuration) -> States | None:
 
 
 class Receivers:
-    """The receivers of the configurations `names`, None: of all, and what they remember.
+    """The receivers of the configurations `names`, None: of all, with their memory.
 
     Time chunks of one log are received one after the other, in order of time.
     """
@@ -381,7 +381,7 @@ class Receivers:
         return self._schedules[name].issue_s
 
     def fuse(self, world: WorldChunk, name: str) -> ReceiverOutput:
-        """What the receiver of a configuration issues in a time chunk, of the lists that reach it.
+        """The output of a configuration's receiver in a time chunk, from the lists that reach it.
 
         Raises InputError where a fusion of the user's own fails.
         """
@@ -509,13 +509,13 @@ class Receivers:
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
-    """(U,) which of the units that are received leave objects out of their messages."""
+    """Mask (U,) of the received units that send partial lists: they leave objects out of their messages."""
     partial = set(experiment.partial)
     return np.array([unit in partial for unit in received.units], dtype=bool)
 
 
 class Reach:
-    """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
+    """The earliest captures that receivers need in a time chunk: of lists that arrive, are cached, or looked back to.
 
     `received`: by configuration the lists that reach its receiver, whatever is in them. `stated`: the captures that
     their units state, None where these are true.
@@ -566,7 +566,7 @@ class Reach:
 
 
 def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int, Int]:
-    """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.
+    """The units' lists as a real fusion gets them: without truth ids, the entries of each list in a random order.
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
     Third, (N,): the row of each entry.

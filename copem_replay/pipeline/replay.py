@@ -57,7 +57,7 @@ WORTH_A_BLOCK = 2_000_000
 
 @dataclass(frozen=True)
 class BlockOutcome:
-    """What a block of runs (S,) gives: columns of `detections.parquet`, and the scores of the lists by configuration.
+    """The results of a block of runs (S,): columns of `detections.parquet`, and scores of the lists by configuration.
 
     `assessed (M,)`: of which episodes accuracy is measured, the first of each object. `worked_s`: seconds it took;
     `accuracy_s`: those that `measure: {accuracy: false}` would save.
@@ -78,7 +78,7 @@ class BlockOutcome:
 
 
 def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
-    """All runs, or those of a range, cut into blocks that are small enough for memory and enough for the workers."""
+    """The runs, or a range of them, cut into blocks: small enough for memory, and enough of them for the workers."""
     begin, end = runs or (0, experiment.runs)
     units = replay.expand(experiment)
     rows, room = ROWS_A_CHUNK, CHUNK_BYTES
@@ -126,7 +126,7 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
 
 
 def replay_outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[BlockOutcome]:
-    """What one block of runs (S,) gives; in several parts where not all runs have the same lists."""
+    """The outcomes of one block of runs (S,); several parts where not all runs have the same lists."""
     began_s, units, measure = time.perf_counter(), replay.expand(experiment), experiment.measure
     # Which lists there are decides which hits are consecutive.
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_lists(units)
@@ -162,7 +162,7 @@ class GroupOutcome(NamedTuple):
 
 
 def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOutcome:
-    """What every configuration knows of every object, in the runs (S,) of a group, which have the same lists."""
+    """The events and scores of every configuration in the runs (S,) of a group, which have the same lists."""
     units, measure = log.expand(experiment), experiment.measure
     # For detection by truth id alone is drawn which rows are listed; else states as well, for matches of all rows.
     matched = _needs_lists(units)

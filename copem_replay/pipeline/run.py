@@ -84,7 +84,7 @@ class _Computing(NamedTuple):
 
 
 class Gatherer:
-    """Computes parts, or finds them. `advance`: called with the number of runs of a log that are done."""
+    """Computes parts or reads them from the cache. `advance`: called with the number of runs of a log that are done."""
 
     def __init__(
         self, jobs: int, cost: RunCost, cache: PartCache | None, advance: Callable[[int], None] = lambda _: None
@@ -93,7 +93,7 @@ class Gatherer:
 
     def each(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[PartTables]:
         """The parts of each log, by block of runs, then by configuration. The next log is read when workers are nearly
-        idle; no more than the parts that are computed are in memory.
+        idle; only parts that are being computed are in memory.
         """
         began_s, waiting = time.perf_counter(), deque[_Computing]()
         pool, reading = ThreadPoolExecutor(self._jobs), ThreadPoolExecutor(_AT_ONCE)
@@ -236,12 +236,12 @@ class StudyTables:
 
     @property
     def recordings(self) -> tuple[KnownLog, ...]:
-        """The recording of each log, its content being in memory or not."""
+        """The recording of each log, with or without its content in memory."""
         return tuple(log.recording for log in self.logs)
 
     @cached_property
     def facts(self) -> tuple[LogFacts, ...]:
-        """What results say of each log beside its rows."""
+        """The facts of each log that results state beside its rows."""
         return tuple(log.facts(self.experiment) for log in self.logs)
 
     def find_log(self, name: str) -> StudyLog:
@@ -430,7 +430,7 @@ def _summarise_slices(study: StudyTables, horizon_s: float) -> pd.DataFrame | No
 
 
 def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFacts], horizon_s: float) -> SliceSettings:
-    """What the figures of groups are computed with."""
+    """The settings from which figures of groups are computed."""
     measure = experiment.measure
     return SliceSettings(
         tuple(experiment.configurations),

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ConfigurationScores:
-    """The scores of one configuration in the runs (S,), or in the one that stands for all.
+    """The scores of one configuration in the runs (S,), or in one where all are equal.
 
     `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`,
     `false_tracks`: with `accuracy`; `needless`: with it where a driver is asked.
@@ -52,7 +52,7 @@ class ConfigurationScores:
 
 
 def match_lists(cache: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
-    """Which true object each entry of the fused lists is about, at the instant it tells of."""
+    """The true object that each entry of the fused lists is about, at the instant it tells of."""
     world = cache.at(output.instants.issue_s) if output.tells_of == "now" else _interpolate_told_world(cache, output)
     gate_m = measure.match.gate_m
     return match_entries(output.told, world, cache.scene, output.origins, gate_m=gate_m, tells_of=output.tells_of)
@@ -92,7 +92,7 @@ def _list_captures(output: ReceiverOutput) -> Float:
 
 
 def match_run(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
-    """As `match_lists`, but that an entry about nobody that is at somebody now is a second entry: it is not false."""
+    """As `match_lists`; but an entry about no object that is at one now is a second entry, not a false one."""
     matches, now = match_lists_twice(around, output, measure)
     somebody = (matches.role == GHOST) & (now.role != GHOST)
     role = np.where(somebody, np.int8(DUPLICATE), matches.role)
@@ -108,7 +108,7 @@ def _match_by_id(matches: Matches, origins: Origins) -> Matches:
 
 
 class Judge:
-    """Measures what the receiver of one configuration issues, chunk by chunk: detection, accuracy and conflicts.
+    """Measures the output of one configuration's receiver, chunk by chunk: detection, accuracy and conflicts.
 
     `issue_s (K,)`: when its lists of the whole log are available. `matches`: whether its lists are matched.
     """
@@ -131,7 +131,7 @@ class Judge:
             )
 
     def match(self, cache: TruthCache, output: ReceiverOutput) -> tuple[Matches, Matches] | None:
-        """Matches of the lists of a time chunk, whose truth is in `cache`; None: they are not asked for.
+        """Matches of the lists of a time chunk, whose truth is in `cache`; None: matches are not needed.
 
         At the instants that entries tell of, and for accuracy at those at which their lists are available.
         """
@@ -146,7 +146,7 @@ class Judge:
         return matches, matches
 
     def measure(self, cache: TruthCache, output: ReceiverOutput, pair: tuple[Matches, Matches] | None) -> None:
-        """Take in the lists of a time chunk, and what `match` gives of them."""
+        """Add the lists of a time chunk, with the result of `match`."""
         issue_s = output.instants.issue_s
         if pair is not None:
             lists, (matches, now) = output.lists, pair
@@ -196,7 +196,7 @@ class Judge:
             )
 
     def conflict_known_s(self) -> Float | None:
-        """(S | 1, M) when a list first implied a collision, NaN: never; None: it is not asked for."""
+        """(S | 1, M) when a list first implied a collision, NaN: never; None: conflicts are not measured."""
         return None if self._conflicts is None else self._conflicts.result()
 
     def scores(self, runs: int) -> ConfigurationScores | None:

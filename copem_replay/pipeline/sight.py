@@ -1,4 +1,4 @@
-"""Sight at the frames of the truth: what every modelled unit has of some objects, and the body that hides most of them.
+"""Sight at the frames of the truth: how modelled units see the shown objects, and the body that hides most of each.
 
 Lanes, stories and causes name what they name from here. Columns of tables come from the same states, at the lists of
 units (`perception/sight.py`).
@@ -59,7 +59,7 @@ class Sight:
     place_m: Float  # (U, K, 3), of the units
 
     def find_best(self, units: Sequence[int], m: int) -> tuple[Int, Int]:
-        """(K,) the best state that some modelled units have of object m, and whose: of equal ones who sees most."""
+        """(K,) the best state of object m among modelled units, and its unit (K,): of equals the one that sees most."""
         state = self.state[units][:, :, m]
         best = np.argmax(state + 0.5 * np.nan_to_num(self.share[units][:, :, m]), axis=0)
         return state[best, np.arange(len(best))], np.array(units)[best]
@@ -131,7 +131,7 @@ class StatusSpan:
 
 
 class SpanNames(NamedTuple):
-    """Names of units, and of bodies as in `Sight.body_ix`."""
+    """Names by unit, and by body as in `Sight.body_ix`."""
 
     units: Sequence[str]
     bodies: Sequence[str]
@@ -157,7 +157,7 @@ def list_spans(
 
 
 def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
-    """The instants, of ascending ones (K,), that hold anywhere between two times."""
+    """Indices of the instants, out of ascending ones (K,), that hold anywhere between two times."""
     time_s = elapsed_ns * 1e-9
     return np.flatnonzero(
         (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
@@ -167,7 +167,7 @@ def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
 def list_sight_spans(
     replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
 ) -> list[StatusSpan]:
-    """What the units `names` have of object m between two instants; nothing of recorded units."""
+    """The sight of object m by the units `names` between two instants; nothing of recorded units."""
     unit_names = list(replay.expanded.units)
     sensing = replay.expanded.list_sensing(names)
     units = [unit_names.index(name) for name in sensing if name in replay.expanded.modelled]
@@ -217,7 +217,7 @@ def compute_sight(
 
 
 def find_looked_at(replay: Replay, sight: Sight, object_ix: int, curves: Mapping[str, Curve]) -> dict[str, Bool]:
-    """(K,) by curve of the visible share, whether an object is in a field of view of the curve's units then."""
+    """(K,) by curve of the visible share, whether the object is in a field of view of the curve's units."""
     experiment, m = replay.expanded, int(np.flatnonzero(sight.object_ix == object_ix)[0])
     numbers = {name: u for u, name in enumerate(experiment.units)}
     ego = replay.scene.ego_ix

@@ -1,4 +1,4 @@
-"""A log of a study: read and prepared where its objects are needed, else known by the facts that were kept of it.
+"""A log of a study: read and prepared where its objects are needed, else known by its cached facts.
 
 The survey of a study's logs: each is read and checked before any run, and not all of them stay in memory.
 """
@@ -49,7 +49,7 @@ _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class StoredLog(KnownLog):
-    """A log that is known by facts (`said`), its content being read where it is needed (`read`). `about`: their key."""
+    """A log by its cached facts `said`; `read` reads its content when it is needed. `about`: the key of the facts."""
 
     said: Mapping[str, Any]
     read: Callable[[], Recording]
@@ -74,7 +74,7 @@ class StudyLog:
 
     @property
     def known(self) -> Mapping[str, Any] | None:
-        """The facts by which the log is known; None: its content is in memory."""
+        """The cached facts of the log; None: its content is in memory."""
         return self.recording.said if isinstance(self.recording, StoredLog) else None
 
     def replay(self) -> Replay:
@@ -132,14 +132,14 @@ class StudyLog:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What of the log is in the recipes of its parts: its name, by which draws are addressed, and its content."""
+        """The log's part of a recipe: its name, which is in the addresses of draws, and its content."""
         together = self.recording.together
         ahead_ns = [] if together is None else list(together.ahead_ns)
         named = {"name": self.name, "sha256": self.digests["sha256"], "topic": self.recording.topic}
         return named | {"ahead_ns": ahead_ns}
 
     def facts(self, experiment: Experiment) -> LogFacts:
-        """What the results say of the log beside its rows, in an experiment; kept with the parts."""
+        """The facts of the log that results state beside its rows, in an experiment; cached with the parts."""
         if self._facts is None or self._facts[0] is not experiment:
             self._facts = experiment, self._find_facts(resolve_for_log(experiment, self.name))
         return self._facts[1]
@@ -172,7 +172,7 @@ def compute_log_digests(recording: Recording) -> dict[str, Any]:
 
 
 def is_made(log: KnownLog) -> bool:
-    """Whether a log is a recording that was made in memory, so that there is no file of it."""
+    """Whether the recording was made in memory, so that no file has it."""
     read = log.stamps is not None or log.sha256 is not None or not isinstance(log, Recording)
     return not read and isinstance(log.local, Path) and not log.local.exists()
 
@@ -192,14 +192,14 @@ def read_content_digest(recording: Recording) -> str:
 
 
 def drop_content(recording: Recording, read: Callable[[], Recording]) -> StoredLog:
-    """What is known of a recording without its content, which `read` reads again where it is needed."""
+    """The facts of a recording without its content, which `read` reads again where it is needed."""
     said = {"states": recording.object_states, "frames": len(recording.truth.stamp_ns)}
     known = {one.name: getattr(recording, one.name) for one in fields(KnownLog)}
     return StoredLog(**known, said=compute_log_digests(recording) | said, read=read)
 
 
 def survey_key(place: Place, experiment: Experiment, stamps: Sequence[Stamp] | None = None) -> str:
-    """All that the facts of a log depend on: its files and the experiment, resolved for it, as canonical JSON.
+    """Cache key of a log's survey: its files and the experiment resolved for it, as canonical JSON.
 
     `stamps`: the stamps of the files when they were read; None: those that they have now.
     """
@@ -223,7 +223,7 @@ def _survey_parts(experiment: Experiment) -> tuple[str, list[Component | MapFile
 
 
 def file_stamps(place: Place) -> list[Stamp]:
-    """The identity and size of each file, and what changes with its content. Raises RecordingError, InputError."""
+    """The identity, the size and a stamp of the content of each file. Raises RecordingError, InputError."""
     if isinstance(place, RemoteFile):  # without a stamp no content is ever taken for the same
         return [(str(place), *(place.stamp or (uuid4().hex,)))]
     return _drop_paths(read_file_stamps(place))
@@ -236,7 +236,7 @@ def _drop_paths(files: Stamps) -> list[Stamp]:
 def recall_log(
     parts: PartCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
 ) -> StoredLog | None:
-    """A log by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
+    """A log from its cached facts, in an experiment that is resolved for it; None: none are cached."""
     try:
         key = survey_key(place, experiment)
     except RecordingError:  # reading the recording reports it
@@ -279,11 +279,11 @@ class LogSurvey:
         self._states = 0
 
     def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
-        """A log by the facts that are kept of it; None: it has to be read."""
+        """A log from its cached facts; None: it has to be read."""
         return None if self.parts is None else recall_log(self.parts, place, experiment, read)
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
-        """A recording that was read, in the experiment resolved for it: as it is, or without its truth and lists.
+        """The log of a recording in the experiment resolved for it: with all content, or without truth and lists.
 
         Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
         """

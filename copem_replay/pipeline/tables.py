@@ -224,7 +224,7 @@ class PartTables:
 
     @property
     def tables(self) -> tuple[pa.Table | None, ...]:
-        """Its tables, those that it has first."""
+        """The tables of the part, the required ones first."""
         return self.rows, self.beside, self.runs, self.false_tracks, self.needless
 
 
@@ -426,7 +426,7 @@ def pack_part(part: PartTables, about: str = "") -> bytes:
 
 
 def unpack_part(content: bytes, log: str, configuration: str, recipe: str = "") -> PartTables:
-    """The part that `pack_part` gave. Raises ValueError, KeyError, TypeError or OSError for other bytes or text."""
+    """The part in bytes of `pack_part`. Raises ValueError, KeyError, TypeError or OSError for other bytes or text."""
     reader, tables = pa.BufferReader(content), list[pa.Table]()
     while reader.tell() < reader.size():
         tables.append(ipc.open_stream(reader).read_all())

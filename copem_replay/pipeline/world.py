@@ -1,4 +1,4 @@
-"""The world in some runs of a log: what units perceive of it, send of that, and when it reaches each receiver."""
+"""The world in some runs of a log: what units perceive and send of it, and when each receiver gets it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ States = Literal["true", "expected", "sampled"]
 
 @dataclass
 class WorldChunk:
-    """A log, or a time chunk of one, in the runs (S,) of a group, as the units of an experiment have it.
+    """A log, or a time chunk of one, in the runs (S,) of a group, as the units of an experiment perceive it.
 
     `observations`: rows of the modelled units. Includes earlier captures that the chunk needs, back to `earliest_s`.
     `complete`: with the rows of all objects and with ghosts, else only of objects with an episode. `sending`: what
@@ -94,7 +94,7 @@ class WorldChunk:
         return draw_ghosts(self.scene, self.observations, self.experiment, self.log.placed, run, between_s)
 
     def listed(self, states: States) -> Tracks:
-        """What all units list, whatever their lists come from: rows of objects, ghosts, then rows of recorded units.
+        """All rows of all units' lists: rows of objects, ghosts, then rows of recorded units.
 
         Ghosts are left out where states are the expected ones: ideal fusion alone has those.
         """
@@ -113,7 +113,7 @@ class WorldChunk:
         return self._listed[states]
 
     def sent(self, states: States) -> Tracks:
-        """What all units send of what they list."""
+        """The listed rows that units send."""
         if self.sending is None:
             return self.listed(states)
         if states not in self._sent:
@@ -134,7 +134,7 @@ class WorldChunk:
 
     @cached_property
     def words(self) -> Words:
-        """The word of the object or ghost of each row, of those of recorded units a number."""
+        """The address word of each row's object or ghost; of rows of recorded units a number."""
         words = object_words(self.scene.object_ids)[self.observations.tracks.row_object_ix]
         numbers = np.arange(0 if self.recorded is None else len(self.recorded.existence), dtype=np.uint64)
         if self.recorded is not None and self.experiment.fusing:  # one object is one to a unit that fuses
@@ -145,7 +145,7 @@ class WorldChunk:
 
     @cached_property
     def claims(self) -> ClaimedRows:
-        """What the units claim of their rows; the same in all runs where no claim is drawn."""
+        """The claims of the units about their rows; equal in all runs where no claim is drawn."""
         observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
         existence, class_ix = observations.existence, observations.view.class_ix
         claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
@@ -195,7 +195,7 @@ class Transmission:
         self._lists = WorldChunk(log, self.experiment, group, never, log.no_rows, np.inf, False, self._sending)
 
     def world(self, chunk: TimeChunk, earliest_s: float) -> WorldChunk:
-        """A time chunk with captures back to `earliest_s`; that of a log in one is kept."""
+        """A time chunk with captures back to `earliest_s`; cached where it is the whole log."""
         log, world = self.log, self._whole
         if world is None:
             observations = log.observe_listable(chunk, earliest_s, complete=self._complete)
@@ -215,7 +215,7 @@ class Transmission:
         return self._lists.truth
 
     def send(self, sightings: Tracks) -> Tracks:
-        """The rows of objects that are sent, of those that are listed."""
+        """The sent rows of objects, out of the listed ones."""
         if self._sending is None:
             return sightings
         words = object_words(self.log.scene.object_ids)[sightings.row_object_ix]
@@ -224,9 +224,9 @@ class Transmission:
         return self._sending.of(sightings, words)
 
     def arriving(self, name: str) -> Tracks:
-        """The lists that the receiver of a configuration hears, by when links deliver them; those of others never are.
+        """The lists that reach the receiver of a configuration, with the arrival on their links; others never arrive.
 
-        Those of the last configuration are kept. Raises InputError where a link of the user's own fails.
+        Those of the last configuration are cached. Raises InputError where a link of the user's own fails.
         """
         if self._arriving is None or self._arriving[0] != name:
             self._arriving = name, self._transmit(name)
@@ -243,11 +243,11 @@ class Transmission:
         return transmit(lists, experiment.links_of(name), heard, air=air)
 
     def received(self, name: str) -> Tracks:
-        """The lists that the receiver of a configuration hears, by when it takes them in (`issue_hz`)."""
+        """The lists that reach the receiver of a configuration, with the instant it takes each in (`issue_hz`)."""
         return sample_arrivals(self.arriving(name), self.experiment.configurations[name].issue_hz)
 
     def receive(self, rows: Tracks, name: str) -> Tracks:
-        """Rows in the lists that the receiver of a configuration hears; configurations share them and their draws."""
+        """Rows in the lists that reach the receiver of a configuration; configurations share them and their draws."""
         return replace(rows, arrives_s=self.received(name).arrives_s)
 
     def _own_chunks(self) -> Iterator[WorldChunk]:
@@ -312,7 +312,7 @@ _VRU = class_indices(("vru",))
 
 
 class ClaimedRows(NamedTuple):
-    """What units claim of rows (P,), as `WorldChunk.listed` has them; `same`: equal where they see one object."""
+    """The claims of units about rows (P,), as `WorldChunk.listed` has them; `same`: equal for one object."""
 
     claims: EntryClaims
     same: Words
@@ -320,7 +320,7 @@ class ClaimedRows(NamedTuple):
 
 @dataclass(frozen=True)
 class SentObjects:
-    """What units send in one run: `lists (F,)` not held back, and `keys` of the rows that `partial (U,)` units send."""
+    """The sent objects of one run: `lists (F,)` not held back, and `keys` of the rows of `partial (U,)` units."""
 
     lists: Bool
     partial: Bool
@@ -340,7 +340,7 @@ def _key_rows(frame_ix: Int, words: Words) -> Words:
 
 
 def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldChunk]) -> SentObjects:
-    """What units send of the lists of one run, chunk after chunk; lists have the same numbers in all chunks."""
+    """Select the objects that units send in one run, chunk after chunk; lists have the same numbers in all chunks."""
     units = list(experiment.units)
     last = LastSent([experiment.sends.get(name) for name in units])
     sending = np.array([name in experiment.sends for name in units], dtype=bool)
