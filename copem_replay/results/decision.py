@@ -99,7 +99,7 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
 
 
 def describe_verdicts(verdicts: Judgement) -> str:
-    """Whether results are good enough, by all criteria; of those that do not pass the first is named."""
+    """Whether results are good enough by all criteria; of those that do not pass, the first is named."""
     number, failing = len(verdicts.all), [one for one in verdicts.all if not one.passes]
     if not failing:
         return "Good enough: the one verdict passes." if number == 1 else f"Good enough: all {number} verdicts pass."

@@ -61,7 +61,7 @@ class FolderFiles:
     made: frozenset[str]
 
     def is_ours(self, name: str) -> bool:
-        """Whether a file, or one in the folder of this name, is listed."""
+        """Whether the lists have this file, or a file in the folder of this name."""
         return any(one == name or one.startswith(f"{name}/") for one in (self.results or frozenset()) | self.made)
 
     def list_others(self, folder: Path, written: Collection[str]) -> list[str]:
@@ -71,7 +71,7 @@ class FolderFiles:
 
 
 def list_belongings(folder: Path) -> FolderFiles | None:
-    """The files of a results folder; None: it is not one."""
+    """The listed files of a results folder; None: it is no results folder."""
     try:
         provenance: Any = parse_json((folder / MARK).read_bytes())
     except (OSError, ValueError):
@@ -221,7 +221,7 @@ class ResultsPlace:
 
     @property
     def shown(self) -> Path:
-        """The folder of the results, as it was given where they are there."""
+        """The folder of the results, in the user's spelling unless they had to go elsewhere."""
         return self.asked if self.folder == self.asked_folder else self.folder
 
     @property
@@ -383,7 +383,7 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
 
 
 def find_taken(others: Iterable[str], files: Collection[str]) -> list[str]:
-    """The user's own files whose names the results need, themselves or for a folder."""
+    """The user's own files that have a name which the results need, as a file or as a folder."""
     folders = {parent.as_posix() for file in files for parent in Path(file).parents}
     taken = folders.union(files)
     return [n for n in others if n in taken or any(parent.as_posix() in files for parent in Path(n).parents)]

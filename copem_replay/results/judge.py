@@ -56,9 +56,9 @@ from copem_replay.results.slices import read_slices, read_study_rows
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict, judge_limits
 
 CLOSED_FORM = "closed form"
-"""The kind of an interval of what is computed without a draw: of these logs it is known."""
+"""The kind of interval of a figure in closed form: exact for these logs."""
 FEWEST_RUNS = 30
-"""Over fewer runs there is no interval of what several objects give."""
+"""With fewer runs a figure over several objects has no interval."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def judge_own_criteria(results: Results) -> Judgement | None:
 
 
 def find_population(results: Results) -> str:
-    """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
+    """The population of `compare`'s intervals: these logs where they are over runs of one object, else such traffic."""
     clusters = find_clusters(results.known)
     return "these_logs" if clusters is not None and clusters.by_run else "such_traffic"
 
@@ -568,7 +568,7 @@ def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple
 
 
 def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool, weigh: str = OBJECTS) -> tuple[Clusters | None, str]:
-    """What an interval of rows is over, or why there is none; `of_runs`: the runs, else as `choose_over` has it."""
+    """The clusters of an interval of rows, or why there are none; `of_runs`: the runs, else by `choose_over`."""
     counts = count_clusters(table)
     if of_runs:
         runs = table["run"].nunique()

@@ -115,7 +115,7 @@ class Results:
 
     @property
     def place(self) -> Path:
-        """The folder, or what results that are not saved are called in messages."""
+        """The folder, or the name for unsaved results in messages."""
         return self.folder or self._called
 
     @property

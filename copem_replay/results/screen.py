@@ -106,10 +106,9 @@ def tabulate_alike(
     groups: Sequence[str] = (), pad: Callable[[str, int], str] = str.rjust, more_in: str = "--explain",
     most: int = _MOST_ROWS,
 ) -> tuple[list[str], list[str]]:  # fmt: skip
-    """Configurations and their cells in columns of equal width, those with the same cells in one row, of many the
-    first; and the lines that have one of the `best`.
+    """Aligned rows of configurations and cells, one row for equal cells; and the rows with one of the `best`.
 
-    `groups`: words above each column; alike ones that are neighbours stand there once. `more_in`: where the others are.
+    `groups`: words above columns, once for neighbours with equal words. `more_in`: where omitted ones are.
     """
     names_by_cells: dict[tuple[str, ...], list[str]] = {}
     for name, cells in rows:
@@ -181,7 +180,7 @@ SHOWN = {
 
 
 def choose_notes(notes: Sequence[str]) -> list[str]:
-    """Notes without those that are about other figures than those of the screen, in fewer words."""
+    """The notes about figures on the screen, in fewer words."""
     notes = [re.sub("^no interval of [^:]*: ([^;]*);.*", r"no interval: \1", note) for note in notes]
     named = [{*re.findall(r"\w+", note)} & {*COMPARED} for note in notes]
     return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*SHOWN}]
@@ -262,9 +261,7 @@ def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: boo
 
 
 def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
-    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; of other metrics with a sign. `alike`: also
-    why there is no interval.
-    """
+    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; else signed. `alike`: also why no interval."""
     if row is None or pd.isna(row.difference):
         return "–"
     size, limits = float(row.difference), (row.low, row.high)

@@ -26,14 +26,14 @@ _OTHER_EACH_TIME = ".rrd"
 
 
 def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object]) -> dict[str, object]:
-    """What `provenance.json` says, with the seals of the named files in a folder, and of itself. Raises OSError."""
+    """The data of `provenance.json`, with the seals of the named files in a folder, and of itself. Raises OSError."""
     seals = {name: digest_file(folder / name) for name in names if name != MARK and not name.endswith(_OTHER_EACH_TIME)}
     sealed = {**said, SEALS: seals}
     return {**sealed, SEALS: seals | {MARK: _digest_said(sealed)}}
 
 
 def seal_recordings(folder: Path, names: Iterable[str]) -> list[str]:
-    """Seal those of the named files in a folder whose bytes are others each time. Returns the name of the list, if any.
+    """Seal the named files of a folder whose bytes differ in each writing. Returns the name of the list, if any.
 
     Raises OutputError, OSError.
     """

@@ -66,7 +66,7 @@ def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, ta
 
 
 def is_observed(episodes: pd.DataFrame) -> pd.Series:
-    """Whether each of some episodes, given by `onset_s` and `ended_s`, is not too short to judge."""
+    """Whether episodes, given by `onset_s` and `ended_s`, are long enough to judge."""
     return np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"]) >= OBSERVED_S - SAME_INSTANT_S
 
 
@@ -120,7 +120,7 @@ def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) ->
 def pick_evenly(
     ranked: Sequence[str], most: int, fixed: Sequence[str] = (), colours: Mapping[str, object] = MappingProxyType({})
 ) -> tuple[str, ...]:
-    """`fixed`, and so many of the ranked names that they are `most`, evenly spaced, with the first and the last one.
+    """`most` of the ranked names: `fixed`, and others evenly spaced with the first and the last.
 
     Instead of one with a colour that is taken, the nearest one with another, if there is any.
     """

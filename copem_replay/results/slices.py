@@ -113,7 +113,7 @@ def _format_limits(low: float, high: float, apart: bool) -> str:
 
 
 def describe_groups(rows: pd.DataFrame) -> list[str]:
-    """What is said of groups, those with the same words together; what intervals are over."""
+    """Lines on groups, one for those with equal words; and on what intervals are over."""
     limited = rows.loc[rows["interval_over"].notna(), ["interval_over", "interval_clusters"]]
     lines = []
     for over, group in limited.groupby("interval_over", sort=False):

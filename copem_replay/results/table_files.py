@@ -46,7 +46,7 @@ def read_parquet(path: Path, files: Sequence[Path] = ()) -> pd.DataFrame:
 
 
 def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mapping[str, str]) -> pd.DataFrame:
-    """A table with at least these columns, each checked by what is known of it. Raises InputError."""
+    """A table with at least these columns, each checked against its definition. Raises InputError."""
     with _report_damage(path):
         table = reader(path)
     check_columns(path, kinds, table.columns)

@@ -46,7 +46,7 @@ def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
 
 
 def choose_named_objects(table: pd.DataFrame) -> list[str]:
-    """Ids of the objects that are named: those that configurations detect at the most different times."""
+    """Ids of the objects with a visible name: those whose detections differ most between configurations."""
     time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
     apart = time_s.groupby(table["object_id"], sort=False).agg(lambda times: times.max() - times.min())
     return list(apart.sort_values(ascending=False, kind="stable").index[:NAMED_OBJECTS])

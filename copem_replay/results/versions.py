@@ -40,7 +40,7 @@ class VersionChange(NamedTuple):
 
 
 def tell_change(comparison: Comparison) -> VersionChange:
-    """What changed from older results to newer ones."""
+    """The change from older results to newer ones."""
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
     known = [name for name in comparison.configurations if name not in comparison.truths]
     changed = [name for name in known if name not in comparison.unchanged]

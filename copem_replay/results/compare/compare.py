@@ -113,12 +113,12 @@ class AllLogs:
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """How many logs, objects and passes both sides have rows of."""
+        """The number of logs, objects and passes of which both sides have rows."""
         of_logs = next(iter(self._regrets.values()), [])
         return total_counts(counts for regret in of_logs for counts in regret.counts)
 
     def count_better(self, metric: str) -> int:
-        """The number of logs whose own difference is for the better."""
+        """The number of logs in which the configuration is better."""
         return sum(COMPARED[metric].better * difference > 0 for difference in self.differences.get(metric, ()))
 
     def regrets(self, weigh: str | None) -> Iterator[Regret]:
@@ -131,10 +131,9 @@ class AllLogs:
 
 @dataclass(frozen=True)
 class PairsAsked:
-    """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
-    is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
-    began. `over_runs`: intervals are over runs of the logs. `weigh`: what counts alike; None: as `measure.weigh`.
-    `by_log`: there are also rows of each log.
+    """The rows and intervals of a comparison. `episodes`: by log the objects and episodes to compare, or all of a log
+    (None); None: all logs. `every`: all of these count, however they began. `over_runs`: intervals are over runs of the
+    logs. `weigh`: what counts alike; None: as `measure.weigh`. `by_log`: there are also rows of each log.
     """
 
     episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
@@ -145,7 +144,7 @@ class PairsAsked:
     by_log: bool = True
 
     def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
-        """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
+        """A side of a pair with only the requested cells; ghosts belong to whole logs."""
         counted = side.counted_however_begun if self.every else side.counted
         if self.episodes is None or (kept := self.episodes.get(log, ())) is None:
             return replace(side, counted=counted)
@@ -157,9 +156,7 @@ class PairsAsked:
 
 
 def read_folders(inputs: Sequence[Path | Results]) -> list[Results]:
-    """Results folders; open ones are not read again. Raises InputError, a line for each folder that cannot be read or
-    is given twice.
-    """
+    """Results folders; open ones are not read again. Raises InputError, a line per unreadable or repeated folder."""
     folders: list[Results] = []
     problems: list[str] = []
     first_path: dict[str, Path] = {}
@@ -281,7 +278,7 @@ class Comparison:
 
     @property
     def changed(self) -> Comparison:
-        """Without the configurations that are unchanged."""
+        """The comparison without configurations that are unchanged."""
         names = tuple(name for name in self.configurations if name not in self.unchanged)
         table, groups = (of if of is None else of[of["configuration"].isin(names)] for of in (self.table, self.groups))
         return replace(self, configurations=names, table=table, groups=groups)
@@ -385,9 +382,9 @@ def _check_named(decide: str | None, matters: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class Stars:
-    """How the stars of a table are held: over all its differences, or those of the metric that was named to `decide`.
+    """How differences get a star: all of a table held together, or those of the one metric named to `decide`.
 
-    `matters`: by metric the least difference that matters. `without`: configurations of which nothing can differ.
+    `matters`: by metric the least difference that matters. `without`: configurations in which nothing can differ.
     """
 
     decide: str | None
@@ -395,7 +392,7 @@ class Stars:
     without: Sequence[str] = ()
 
     def mark(self, rows: Sequence[dict[str, Any]], limit: Sequence[Callable[[float], Mapping[str, object]]]) -> None:
-        """Give rows, of one table, the columns `star` and `word`; `limit`: of each its limits at a confidence."""
+        """Add the columns `star` and `word` to the rows of one table; `limit`: by row its limits at a confidence."""
         may_differ = (k for k, row in enumerate(rows) if row["configuration"] not in self.without)
         asked = [k for k in may_differ if self.decide in (None, rows[k]["metric"])]
         number = sum(rows[k]["difference"] is not None for k in asked)
@@ -507,7 +504,7 @@ def _tabulate_groups(pair_rows: PairRows, of_groups: GroupPairs, groups: Episode
 
 @dataclass(frozen=True)
 class PairRows:
-    """The rows of pairs: what each configuration is held against, in accuracy what it is `remembering`."""
+    """The rows of pairs: the baseline of each configuration, and for accuracy its ideal with memory, `remembering`."""
 
     pairs: Pairs
     remembering: Pairs
@@ -517,9 +514,9 @@ class PairRows:
     def of_all_logs(
         self, sums: Mapping[LabelledConfiguration, AllLogs]
     ) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
-        """The rows of all logs, and of each its limits at a confidence.
+        """The rows over all logs, each with its limits at a confidence.
 
-        Of intervals over logs: how many logs are better, and on which the difference hangs.
+        Of intervals over logs: the number of logs that are better, and the log on which the difference hangs.
         """
         rows: list[dict[str, Any]] = []
         limit: list[Callable[[float], Mapping[str, object]]] = []

@@ -33,7 +33,7 @@ _SHOWN = 12
 
 
 def log_keys(first: Results, other: Results) -> tuple[dict[tuple[str, int], RecordedLog], ...]:
-    """The logs of two folders by the digest of their truth, and a number of those that share it, by name."""
+    """By name of a log the digest of its truth, and its number among the logs with an equal one."""
     logs_of: list[dict[tuple[str, int], RecordedLog]] = []
     for folder in (first, other):
         times = Counter[str]()
@@ -45,7 +45,7 @@ def log_keys(first: Results, other: Results) -> tuple[dict[tuple[str, int], Reco
 
 
 def rename_logs(folders: Sequence[Results]) -> tuple[list[Results], dict[Results, dict[str, str]]]:
-    """The folders with logs named as in the first one; by folder the old names of renamed logs, by their new names."""
+    """The folders with logs named as in the first; and by folder the old names of renamed logs, by new name."""
     renamed, names = [folders[0]], {}
     for other in folders[1:]:
         first, second = log_keys(folders[0], other)
@@ -231,7 +231,7 @@ IDEAL_NAME = "ideal"
 
 
 class Baseline(NamedTuple):
-    """The baseline of an experiment where none is asked for. `why`: in words."""
+    """The default baseline of an experiment. `why`: the reason in words."""
 
     name: str
     why: str
@@ -253,7 +253,7 @@ def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str])
 
 
 def find_alone(results: Results, names: Sequence[str]) -> str | None:
-    """Of `names` the configuration of the car alone: units on the ego only; a real fusion rather than an ideal one.
+    """The configuration of the car alone among `names`: units on the ego only; a real fusion before an ideal one.
 
     Where no unit is on the ego it is the best with one unit. None: there is none.
     """
@@ -281,7 +281,7 @@ def notes_on_output_baseline(pairs: Pairs) -> Iterator[str]:
 
 
 def find_remembering(known: Sequence[LabelledConfiguration], pairs: Pairs) -> Pairs:
-    """The ideal fusions with memory that accuracy is held against, of configurations that remember.
+    """By configuration with memory the ideal fusion with memory that its accuracy is compared with.
 
     Those whose baseline is their own ideal.
     """
@@ -338,7 +338,7 @@ def label_configurations(folders: Sequence[Results]) -> list[LabelledConfigurati
 
 
 def name_folders(folders: Sequence[Results]) -> list[str]:
-    """The names of folders, by which labels tell them apart: paths where names are the same."""
+    """Distinct names of folders, for labels: paths where names are the same."""
     times = Counter(folder.name for folder in folders)
     return [folder.name if times[folder.name] == 1 else str(folder.place) for folder in folders]
 
@@ -351,7 +351,7 @@ def _configuration_names(results: Results) -> list[str]:
 def pair_configurations(
     folders: Sequence[Results], configurations: Sequence[str] | None, baseline: str | None
 ) -> dict[LabelledConfiguration, LabelledConfiguration]:
-    """The configurations to compare, each once, with what each is held against. Raises InputError.
+    """The configurations to compare, each once, with the baseline of each. Raises InputError.
 
     `configurations`: names, of which one that several folders have stands for all of them; None: all. `baseline`: a
     name that is one configuration; None: of one folder that of `find_baseline`, of several each against itself in the

@@ -82,12 +82,12 @@ class GhostTotals:
 
     @property
     def per_min(self) -> float | None:
-        """Ghosts per minute at the lowest existence; None: not known."""
+        """Ghosts per minute at the lowest existence; None: unknown."""
         return float(self.at[0]) / self.minutes if len(self.existence) and self.minutes > 0 else None
 
     @property
     def tells_apart(self) -> bool:
-        """Whether any threshold leaves out some of the entries but not all."""
+        """Whether any threshold of existence removes some entries, but not all."""
         all_left = (self.at == self.at[:1]) & (self.least >= self.existence)
         none_left = (self.at == 0) & (self.most < self.existence)
         return not (all_left | none_left).all()
@@ -95,7 +95,7 @@ class GhostTotals:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Entries of at least `existence` are listed in a share of the drives, in the rest those of at least `above`."""
+    """Thresholds of existence: `existence` in a share of the drives, `above` in the rest."""
 
     existence: float
     above: float  # inf: nothing
@@ -148,7 +148,7 @@ def _add_log(
 
 
 def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint | None:
-    """The operating point with `per_min` ghosts, fewer where all entries make fewer; None: the rate is not known."""
+    """The operating point with `per_min` ghosts, fewer where all entries make fewer; None: unknown."""
     if ghosts.per_min is None:
         return None
     rates = np.append(ghosts.at / ghosts.minutes, 0.0)
@@ -163,7 +163,7 @@ def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint 
 def find_operating_points(
     first: GhostTotals | None, second: GhostTotals | None, per_min: float | None
 ) -> tuple[OperatingPoint, OperatingPoint] | None:
-    """The operating points of both sides; None: one is not known."""
+    """The operating points of both sides; None: one is unknown."""
     if first is None or second is None or per_min is None:
         return None
     kept = find_operating_point(first, per_min), find_operating_point(second, per_min)
@@ -212,7 +212,7 @@ class PairSettings:
 
 @dataclass(frozen=True)
 class HeldCounts:
-    """What is said beside figures of what both hold; counts of several logs add up. (2,): of the first, of the second.
+    """Counts beside figures of held lists; those of several logs add up. (2,): of the first, of the second.
 
     `frames`: object frames are not counted twice: a frame of a run counts once. `without_truth` is over all frames.
     """
@@ -228,7 +228,7 @@ class HeldCounts:
         return HeldCounts(*(getattr(self, of.name) + getattr(other, of.name) for of in fields(HeldCounts)))
 
     def columns(self) -> dict[str, object]:
-        """The columns of a comparison with these counts."""
+        """The counts as columns of a comparison."""
         columns: dict[str, object] = {"frames": self.frames}
         for k, (name, only) in enumerate((("", "only_configuration"), ("baseline_", "only_baseline"))):
             columns[only] = int(self.only[k])
@@ -240,9 +240,9 @@ class HeldCounts:
 
 @dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `counts`: by log the numbers of objects and of passes of which both sides have rows.
+    """A metric of a pair; `counts`: by log the number of objects and of passes with rows on both sides.
 
-    `kept`: operating points of the first and the second, for times at equal ghosts. `held`: beside what both hold.
+    `kept`: operating points of the first and the second, for times at equal ghosts. `held`: counts of held lists.
     """
 
     metric: str
@@ -253,7 +253,7 @@ class Regret:
 
     @property
     def over(self) -> str | None:
-        """The clusters of its interval; None: there are too few."""
+        """The unit of its interval; None: there are too few."""
         return choose_over(*total_counts(self.counts))
 
     @staticmethod
@@ -266,7 +266,7 @@ class Regret:
 
 
 def total_counts(counts: Iterable[tuple[int, int]]) -> tuple[int, int, int]:
-    """How many logs have objects, and how many objects and passes there are, from those of each log."""
+    """The number of logs with objects, of objects and of passes, over all logs."""
     some = [of_log for of_log in counts if of_log[0]]
     return len(some), sum(objects for objects, _ in some), sum(passes for _, passes in some)
 

@@ -116,7 +116,7 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True)
 class AccuracyData:
-    """Accuracy of a configuration: each cell has `length` frames from frame `first` on, at `start` in values.
+    """Accuracy of a configuration: each cell has `length` frames from frame `first` on, at `start` in the values.
 
     What is held at frames is equal in all runs unless runs differ in their units: run s has row `of_run[s]`.
     """
@@ -157,11 +157,11 @@ class PairSide:
 
     @property
     def counted_however_begun(self) -> Bool:
-        """There, and counted if all did, however they began."""
+        """The mask of rows that would count whatever `measure.began` says."""
         return self.there & (self.rows["ended_s"] - self.rows["onset_s"] > SAME_INSTANT_S)
 
     def has_rows_of(self, other: PairSide) -> bool:
-        """Whether all rows, and all lists by their counts, say the same on another side, as far as both are written."""
+        """Whether the other side has equal rows, and equal counts of lists, as far as both are written."""
         if not np.array_equal(self.there, other.there):
             return False
         pairs = [(of[self.there], other.rows[name][self.there]) for name, of in self.rows.items() if name in other.rows]

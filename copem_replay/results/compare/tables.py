@@ -131,7 +131,7 @@ def _format_cells(comparison: Comparison) -> pd.DataFrame:
 
 
 def format_alone(comparison: Comparison, configuration: str) -> str:
-    """What `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)` of the rows; empty: nothing."""
+    """The shares that `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)`; empty: none."""
     of_pair = comparison.overall[comparison.overall["configuration"] == configuration].set_index("metric")
     if not {"ttd_both_s", "detected_share"} <= set(of_pair.index) or not of_pair.loc["detected_share", "n"]:
         return ""
@@ -271,7 +271,7 @@ def _describe_held(comparison: Comparison) -> Iterator[str]:
 
 
 def held_cells(comparison: Comparison) -> pd.DataFrame:
-    """What `position_rmse_held_m` is over, a row per configuration, as text; no rows: it is not compared."""
+    """What `position_rmse_held_m` is over, as one row of text per configuration; no rows: it is not compared."""
     overall = comparison.overall
     rows = overall[(overall["metric"] == "position_rmse_held_m") & overall["frames"].notna()]
     columns: dict[str, list[str]] = {"configuration": list(rows["configuration"])}
