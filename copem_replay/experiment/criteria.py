@@ -38,7 +38,7 @@ class ObjectsOf(Frozen):
         return self
 
     def expanded(self) -> frozenset[str] | None:
-        """The classes, those of groups among them; None: objects are named by their ids."""
+        """The classes, with groups expanded; None: objects are named by their ids."""
         if self.classes is None:
             return None
         return frozenset(member for name in self.classes for member in CLASS_GROUPS.get(name, (name,)))
@@ -125,7 +125,7 @@ class Criterion(Frozen):
         return self.population == "these_logs"
 
     def find_against(self, configuration: str, known: Sequence[str]) -> tuple[str, bool]:
-        """The other side of a difference, and whether it is of the results of before."""
+        """The configuration that the difference is to, and whether it is in earlier results."""
         other = self.against or ""
         if other in known:
             return other, False
@@ -162,7 +162,7 @@ def parse_fail_on(conditions: Sequence[str], against: str, names: Sequence[str] 
 
 
 def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int], measure: Measure) -> Iterator[str]:
-    """Notes on criteria that no number of runs decides, or that so few cannot meet.
+    """Notes on criteria that no number of runs can decide, or that so few cannot meet.
 
     `counted`: by log how many episodes count.
     """
@@ -198,7 +198,7 @@ def _note_too_few(name: str, criterion: Criterion, known: Known, horizon_s: floa
 
 
 def choose_judged(criterion: Criterion, configurations: Mapping[str, Any]) -> list[str]:
-    """The configurations that a criterion is about, of all `configurations` by name."""
+    """The configurations that a criterion judges, out of `configurations`, all by name."""
     if criterion.configurations is not None:
         return list(dict.fromkeys(criterion.configurations))
     judged = [name for name, one in configurations.items() if one.units != TRUTH]

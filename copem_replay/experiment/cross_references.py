@@ -41,7 +41,7 @@ EACH, NAMES, ITEMS = "{}", "names of {}", "[]"
 
 
 def find_values(data: Any, *path: str, prefix: Key = ()) -> Problems:
-    """Each value at a path of plain data, with its key; none where the data has another shape."""
+    """Pairs of key and value at a path of plain data; none where the data has another shape."""
     if not path:
         yield prefix, data
         return
@@ -385,7 +385,7 @@ _ASKED: dict[str, tuple[Callable[[Mapping[str, Any]], bool], str]] = {
 
 
 def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterator[str]:
-    """A line for every metric and configuration that criteria name and the experiment `study`, plain data, has not."""
+    """One line for every metric and configuration that criteria name and the experiment `study`, plain data, lacks."""
     known = [str(name) for name in _mapping(study, "configurations")]
     for name, criterion in _items(source.data, "criteria"):
         key: Key = ("criteria", name)

@@ -97,7 +97,7 @@ def _unit_hint(written: str, meant: str) -> str:
 
 
 def find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
-    """The known key that is alike an unknown one, if any."""
+    """The known key most like an unknown one, if any is."""
     return difflib.get_close_matches(str(key[-1]), known, n=1)
 
 
@@ -243,7 +243,7 @@ def make_plain_source(data: Mapping[str, Any]) -> PlainSource:
 
 
 def format_key(key: Key) -> str:
-    """`units.ego.height_m`, `logs[0]`."""
+    """A key as text: `units.ego.height_m`, `logs[0]`."""
     text = ""
     for part in key:
         name = part or "''"
@@ -445,7 +445,7 @@ def relocate_settings(
 
 
 def settings_places(entries: Sequence[LogEntry], k: int, folder: Path, listed: Listed | None = None) -> list[Place]:
-    """The places of the recordings that the settings of an entry are for."""
+    """The places of the recordings to which the settings of an entry apply."""
     entry = entries[k]
     if isinstance(entry, str):
         return []

@@ -92,7 +92,7 @@ class FrameOfLog(Frozen):
 
 
 def write_frame(frame: Frame) -> FrameOfLog:
-    """A frame as an experiment file has it."""
+    """A frame in the form of the experiment file."""
     return FrameOfLog(proj=frame.proj, offset_m=frame.offset_m, yaw_deg=math.degrees(frame.yaw_rad))
 
 

@@ -99,7 +99,7 @@ class MapFile(Frozen):
         return self._sha256
 
     def read_once(self) -> SiteMap:
-        """The map as its file has it. Raises InputError."""
+        """The map in its file's frame. Raises InputError."""
         return _read_map_once(self.file, self._sha256, tuple(self.heights_m.model_dump().items()))
 
     def place(self, frame: Frame | None) -> SiteMap:
@@ -125,7 +125,7 @@ class MapFile(Frozen):
         return replace(moved, assumed=(*moved.assumed, *notes))
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
-        """The solids of a map that are asked for."""
+        """The solids of a map of the requested kinds."""
         if isinstance(self.solids, bool):
             return list(site.solids) if self.solids else []
         wanted = {name for kind in self.solids for name in _KINDS_OF.get(kind, (kind,))}
@@ -141,7 +141,7 @@ def _read_map_once(file: str, _sha256: str, heights_m: tuple[tuple[str, float], 
 def add_maps(
     recording: Recording, maps: Sequence[MapFile], frame: Frame | None = None
 ) -> tuple[Recording, list[tuple[Key, str]]]:
-    """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
+    """A recording with the content of its maps added, and the problems with them by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
     lanes, notes, problems = list(recording.lanes), list(recording.notes), list[tuple[Key, str]]()
     if lanes:
@@ -206,7 +206,7 @@ def _explain_inside(source: MapFile, inside: Inside) -> str:
 def _choose_solids(
     recording: Recording, solids: Sequence[MapSolid], within_m: float, where: str
 ) -> tuple[list[Solid], list[str], str]:
-    """The solids near any object of the log, what is said of the others, and why none is there, if none is."""
+    """The solids near any object of the log; notes on skipped solids; and the reason where no solid is left."""
     import shapely
 
     counts, truth = Counter[str](), recording.truth

@@ -185,7 +185,7 @@ class RefusedLog:
         return replace(self, key=("logs", entry or 0, *key)) if is_set else self
 
     def said(self, source: ExperimentSource | None) -> str:
-        """The reason as a line, with the place in the experiment file."""
+        """The reason in one line, with the place in the experiment file."""
         line = f"{self.path}: {self.reason}"
         return line if self.key is None or source is None else source.at(self.key, line)
 
@@ -241,10 +241,10 @@ class LogCache(Protocol):
     """A store of logs as they are read, each with the experiment resolved for it. `read` reads the log once more."""
 
     def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
-        """What is known of the log without reading it; None: it has to be read."""
+        """The cached facts of the log; None: it has to be read."""
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
-        """The part of a recording that stays in memory. Raises RecordingError where its files have changed since."""
+        """What stays in memory of a log that was read. Raises RecordingError where its files have changed since."""
 
 
 def read_logs(

@@ -1,4 +1,4 @@
-"""The frame that fixes of a satellite receiver say of a recording: turn and offset of its metres, fitted to them.
+"""The frame fitted to satellite fixes in a recording: turn and offset of the recording's metres.
 
 A recording with odometry of its own and fixes beside it does not say where it is; both together do. The fit is printed
 by `info` with the key to copy, and never applied.
@@ -71,7 +71,7 @@ class FrameFit:
 
     @property
     def words(self) -> str:
-        """One line, with the key to copy."""
+        """The fit in one line, with the key to copy."""
         line = f"{self.fixes:,} fixes of {self.topic}, over {self.way_m:,.0f} m that the ego gets around"
         if not math.isfinite(self.turn_deg):
             return f"{line}: turn not determined, expected {_LEAST_WAY_M:g} m or more"

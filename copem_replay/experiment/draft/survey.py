@@ -327,7 +327,7 @@ class ClockFound:
     late: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """`0.130 s (95 %: 0.120 … 0.140 s)` and the drift, or that it cannot be told."""
+        """The offset in words, `0.130 s (95 %: 0.120 … 0.140 s)`, and the drift; or that they cannot be told."""
         offset = self.offset
         if offset.untold is not None:
             return f"cannot be told: {offset.untold}"
@@ -343,9 +343,7 @@ class ClockFound:
         return words
 
     def plain(self) -> dict[str, object]:
-        """The findings for JSON: seconds, and seconds per second; null where they cannot be told, for which see
-        `untold`.
-        """
+        """The findings for JSON: seconds, and seconds per second; null where they cannot be told (`untold`)."""
         offset = self.offset
         known = offset.untold is None
         return {
@@ -368,9 +366,7 @@ class _TimedLists:
 
 
 def compare_clocks(paths: Sequence[Path]) -> list[ClockFound]:
-    """The clock of each recording but the first. Raises RecordingError for one that cannot be read or has no object
-    list.
-    """
+    """The clock of each recording but the first. Raises RecordingError: not readable, or no object list."""
     t0_ns: int | None = None
     lists_of: list[list[_TimedLists]] = []
     for path, label in zip(paths, label_files(paths), strict=True):

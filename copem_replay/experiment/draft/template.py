@@ -64,7 +64,7 @@ class _Drive:
 
     @property
     def measured(self) -> dict[str, str]:
-        """The keys of `measure` that a log may have for itself, as text."""
+        """The text of the keys of `measure` that a log may set for itself."""
         suffix = "" if self.guess.again_after_s is None else f", again_after_s: {self.guess.again_after_s:g}"
         near = "appears" if self.guess.range_m is None else f"in_range, range_m: {self.guess.range_m:g}"
         return {
@@ -192,9 +192,7 @@ def _draft_unreadable(truth: TruthFound) -> Iterator[str]:
 
 
 def take_proposal(survey: RecordingSurvey) -> RecordingSurvey | None:
-    """The survey as it can be drafted: as it is where it is readable, else with the best list that is read by the names
-    of its fields; None: no proposal is complete.
-    """
+    """The survey where it is readable, else with the best proposal by names of fields; None: none is complete."""
     if survey.readable:
         return survey
     complete = [(truth, proposal) for proposal in survey.proposals if (truth := proposal.truth) is not None]
