@@ -84,7 +84,7 @@ def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) 
 
 @callee
 def spread_component_maximum(row: Int, col: Int, value: Float, n: int, m: int) -> None:
-    """Puts the largest `value (P,)` of its connected component in the place of each pair's own."""
+    """Replace each `value (P,)` by the largest of its pair's connected component."""
     parent, top = np.empty(n, np.int64), np.empty(n)
     for i in range(n):
         parent[i], top[i] = i, -np.inf

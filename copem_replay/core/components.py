@@ -113,7 +113,7 @@ class GivenError(TypeError):
 
 
 def ask_component(component: Component, where: str, work: Callable[[], T]) -> T:
-    """The answer of a component. Raises InputError where a user's own fails; a built-in one's is a defect."""
+    """A component's answer to a call. Raises InputError where a user's own fails; a built-in one's is a defect."""
     try:
         return work()
     except FAILURES as error:
@@ -125,7 +125,7 @@ def ask_component(component: Component, where: str, work: Callable[[], T]) -> T:
 
 
 def wrong_answer_error(component: Component, where: str, message: str, *methods: str) -> InputError:
-    """The error for a wrong answer of a component, with file and line of the first of these methods that is own."""
+    """The error for an invalid return value, with file and line of the first user-defined method of `methods`."""
     return InputError(f"{where}: {component.kind}: {message}{describe_source_line(type(component), *methods)}")
 
 
@@ -133,9 +133,9 @@ def ask_numbers(
     component: Component, where: str, call: str, answer: Callable[[], Any], shape: tuple[int, ...], expected: str,
     most: float = np.finfo(np.float64).max,
 ) -> Float:  # fmt: skip
-    """Numbers from 0 to `most` that a component answers to a call, `probability(view)`. Raises InputError for others.
+    """Numbers from 0 to `most` that a component returns for a call, `probability(view)`. Raises InputError for others.
 
-    `expected`: what is expected of them.
+    `expected`: the words for what is expected.
     """
     method = call.partition("(")[0]
     numbers = ask_component(component, where, lambda: np.asarray(answer(), dtype=np.float64))

@@ -33,14 +33,14 @@ from copem_replay.core.waiting import await_server
 
 
 def escape_unprintable(text: str) -> str:
-    """On one line, and without what a terminal would act on: names in a recording may hold anything."""
+    """The text on one line, without characters that a terminal would act on: names in a recording may hold anything."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 MOST_LISTED = 50
-"""So many problems, or names in a message, are listed; of more it is said how many they are."""
+"""At most so many problems, or names in a message, are listed, then "and N more"."""
 _COMPARED = 100
-"""With so many names one that is not known is compared: 20 µs each, and a file may have 10 000 of both."""
+"""An unknown name is compared with at most so many known ones: 20 µs each, and a file may have 10 000 of both."""
 
 
 class CopemError(Exception):
@@ -221,19 +221,19 @@ class RemoteFile:
     info: Mapping[str, Any] | None = field(default=None, compare=False)
 
     def __str__(self) -> str:
-        """Without user and query, as it may be written."""
+        """Its URL without user and query, fit to be written."""
         return strip_credentials(self.url)
 
     __repr__ = __str__
 
     @property
     def path(self) -> PurePosixPath:
-        """Its path there, from the bucket or host on."""
+        """Its path from the bucket or host on."""
         return PurePosixPath("/" + str(self).partition("://")[2])
 
     @property
     def name(self) -> str:
-        """The last part of it."""
+        """The last part of its path."""
         return self.path.name
 
     @cached_property
@@ -398,7 +398,7 @@ FAILURES = (Exception, SystemExit)
 
 
 def is_own(component: type[Any]) -> bool:
-    """Whether a class is a user's own, not built in."""
+    """Whether a class is the user's, not built in."""
     return not component.__module__.startswith("copem_replay.")
 
 

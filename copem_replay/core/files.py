@@ -87,7 +87,7 @@ def _encode(match: re.Match[str]) -> str:
 
 
 def hidden_name(name: str) -> str:
-    """`.NAME`, the beginning of names of temporary files beside NAME; of a very long name its start and its digest."""
+    """`.NAME`, with which temporary files beside NAME begin; of a very long name, its start and its digest."""
     encoded = os.fsencode(name)
     if len(encoded) <= _LONGEST:
         return f".{name}"
@@ -95,7 +95,7 @@ def hidden_name(name: str) -> str:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file or folder has a name that is given until it is complete."""
+    """Whether a file or folder has a temporary name, which it bears until it is complete."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
@@ -131,7 +131,7 @@ def _is_unfinished(entry: os.DirEntry[str]) -> bool:
 
 
 def check_parent(path: Path, look: Callable[[Path], object] = os.lstat) -> None:
-    """Raise OutputError where a path cannot be written, as far as the folder shows it that it is, or would be, in."""
+    """Raise OutputError where `path` cannot be written, as far as its folder, present or future, shows it."""
     try:
         parent = next((place for place in Path(os.path.abspath(path)).parents if place.exists()), Path("/"))
         with suppress(FileNotFoundError, NotADirectoryError):
@@ -150,7 +150,7 @@ def check_parent(path: Path, look: Callable[[Path], object] = os.lstat) -> None:
 
 
 def may_be_moved(folder: Path) -> bool:
-    """Whether another folder may take the name of this one: no mount point, and not where this process works."""
+    """Whether another folder may replace this one: it is no mount point, and not the working folder of this process."""
     here = Path.cwd()
     return not os.path.ismount(folder) and folder not in (here, *here.parents)
 
@@ -159,7 +159,7 @@ def may_be_moved(folder: Path) -> bool:
 
 
 def try_lock(fd: int) -> bool | None:
-    """Whether the lock of an open file is now this process's. None: the system, or the file system, has no locks."""
+    """Lock an open file; whether this process has the lock now. None: the system, or the file system, has no locks."""
     if fcntl is None:
         return _try_lock_byte(fd)
     try:
@@ -184,14 +184,14 @@ def _try_lock_byte(fd: int) -> bool | None:
 
 
 def overwrite_file(fd: int, content: bytes) -> None:
-    """Make this the content of an open file. Raises OSError."""
+    """Replace the content of an open file. Raises OSError."""
     os.lseek(fd, 0, os.SEEK_SET)
     os.write(fd, content)
     os.ftruncate(fd, len(content))
 
 
 def is_still(path: Path, fd: int) -> bool:
-    """Whether an open file is still the one of this name."""
+    """Whether `name` still names this open file."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(fd), os.lstat(path))
     return False
@@ -220,7 +220,7 @@ def _create_locked(prefix: Path, suffix: str = "", *, folder: bool = False) -> t
 
 @contextmanager
 def atomic_file(path: Path, *, flush: bool = True) -> Iterator[Path]:
-    """The path to write `path` at: it gets its name when all went well, and is removed when anything did not.
+    """The path to write `path` at: it is renamed when all went well, and removed otherwise.
 
     Missing folders are made. `flush`: it is on the disk before it has its name. Raises OutputError when it cannot be
     written.
@@ -262,7 +262,7 @@ class ScratchFolder:
 
     @property
     def old(self) -> Path:
-        """What was under the final name, once it is replaced."""
+        """The replaced folder, once the new one has the final name."""
         return self.path / "old"
 
     def may_remove(self, files: Iterable[str]) -> None:
@@ -275,7 +275,7 @@ class ScratchFolder:
 
 @contextmanager
 def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[ScratchFolder]:
-    """A scratch folder for what is to become `path`, beside it or in `place`; removed in the end. Raises OSError."""
+    """A scratch folder for the future `path`, beside it or in `place`; removed in the end. Raises OSError."""
     scratch = ScratchFolder(*_create_locked((place or path.parent) / hidden_name(path.name), folder=True))
     try:
         scratch.new.mkdir()
@@ -389,7 +389,7 @@ def _replace_each(new: Path, folder: Path, names: Sequence[str]) -> None:
 
 
 def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
-    """Remove what killed processes left of `path` beside it, or in `place`. Returns notes for the user.
+    """Remove temporary files of `path` that killed processes left beside it, or in `place`. Returns notes for the user.
 
     A folder that one of them had moved away, to put another in its place, gets its name back.
     """
@@ -475,7 +475,7 @@ def _are_links(place: Path, other: Path) -> bool:
 
 
 def flush_all(folder: Path) -> None:
-    """Flush a folder and all that is in it to the disk. Raises OSError."""
+    """Flush a folder and its content to the disk. Raises OSError."""
     for place, _, names in os.walk(folder):
         for name in names:
             if stat.S_ISREG(os.lstat(file := os.path.join(place, name)).st_mode):

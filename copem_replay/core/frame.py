@@ -30,7 +30,7 @@ _EARTH_RADIUS_M: Final = 6_371_000.0
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a log's metres are: `proj` is what PROJ knows, such as EPSG:25832, and was checked by `make_frame`."""
+    """The frame of a log's metres: `proj` is a text that PROJ reads, such as EPSG:25832, checked by `make_frame`."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -67,7 +67,7 @@ class Frame:
         return np.column_stack([c * x + s * y, c * y - s * x])
 
     def take(self, other: Frame, points_m: Any) -> Places:
-        """Places of this log (N, 2) of places of another frame (N, 2); of one projection without rounding of PROJ.
+        """Places of this log (N, 2) from places of another frame (N, 2); of one projection without rounding of PROJ.
 
         Raises InputError where one of them does not reach a place.
         """
@@ -135,7 +135,7 @@ def make_frame(proj: str, offset_m: tuple[float, float] = (0.0, 0.0), yaw_rad: f
 
 
 class SaidPlace(NamedTuple):
-    """What a recording or a map says of its place. `changed`: how it changes within a recording, "": it does not."""
+    """The place that a recording or a map states. `changed`: how it changes within a recording, "": it does not."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -188,7 +188,7 @@ def _check_crs(text: str) -> None:
 
 
 def check_scale(frame: Frame, middle_m: Places) -> Iterator[str]:
-    """A note where a metre of the projection is none on the ground. Raises InputError where it is far from one."""
+    """A note where a projected metre differs from one on the ground. Raises InputError where it differs much."""
     lat, lon = frame.to_wgs84(middle_m)[0]
     if not (math.isfinite(lat) and math.isfinite(lon)):
         raise InputError(f"{frame.proj}: the log's places, with the offset, are nowhere on earth: is it `offset_m`?")
@@ -243,7 +243,7 @@ def _projection(text: str) -> Any:
 
 
 def make_local_proj(lat: float, lon: float) -> str:
-    """A transverse Mercator projection with its origin at a place, scale 1: metres east and north of it."""
+    """A transverse Mercator projection with origin at a place, scale 1: metres east and north of it."""
     return f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +datum=WGS84 +units=m"
 
 

@@ -55,7 +55,7 @@ def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
 
 @borrowing
 def count_below(values: Float, value: float) -> int:
-    """How many of ascending numbers are below a value, of NaN all: what `np.searchsorted` gives, compiled sooner."""
+    """How many ascending numbers are below a value, for NaN all: as `np.searchsorted`, but compiled sooner."""
     first, remaining = 0, len(values)
     while remaining > 0:
         half = remaining // 2

@@ -26,7 +26,7 @@ AROUND_S = 1e-3
 
 
 def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
-    """The world at other instants: one list per instant of `stamps_ns (F,)` (ascending), of all objects then there."""
+    """The world at instants `stamps_ns (F,)`, ascending: one list per instant, of all objects present."""
     own_frames = _find_own_frames(truth, stamps_ns, max_gap_s)
     captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
     if own_frames is not None:
@@ -163,7 +163,7 @@ def _cut_around(truth: Tracks, captured_s: Float, max_gap_s: float) -> Tracks:
 def interpolate_states(
     truth: Tracks, object_ix: Int, time_s: Float, *, t0_ns: int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
-    """States of objects `(K,)` at times `(K,)`: a column `(K,)` per value, and whether the object is there then."""
+    """States of objects (K,) at times (K,): one column (K,) per value, and whether the object is present."""
     # One place more than there are objects: index −1, no truth id, has no track.
     track_of = np.full(int(max(object_ix.max(initial=-1), truth.object_ix.max(initial=-1))) + 2, -1)
     track_of[truth.object_ix] = np.arange(len(truth.object_ix))

@@ -48,7 +48,7 @@ class ListStamps:
     frame_ix: Int
 
     def take(self, rows: Int) -> ListStamps:
-        """All lists, and of the rows only `rows (K,)`."""
+        """All lists, with only the rows `rows (K,)`."""
         return replace(self, frame_ix=self.frame_ix[rows])
 
 
@@ -68,7 +68,7 @@ class Births:
 
 
 def drop_unshared(random_key: RandomKey, shared_by: Of) -> RandomKey:
-    """The address (P,) of a number that more than one unit and object have in common: without what may differ."""
+    """The address (P,) of a number that units or objects share: without the parts in which they differ."""
     if shared_by in ("object", "all"):
         random_key = replace(random_key, units=("",), unit_ix=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
     if shared_by in ("unit", "all"):
@@ -78,7 +78,7 @@ def drop_unshared(random_key: RandomKey, shared_by: Of) -> RandomKey:
 
 
 def drop_capture(random_key: RandomKey) -> RandomKey:
-    """The address (P,) of a number that lasts for a whole run: without the capture."""
+    """The address (P,) of a number that lasts a whole run: without the capture."""
     return replace(random_key, stamp_ns=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
 
 
@@ -95,7 +95,7 @@ def draw_held_uniforms(
 def renewal_stamps(
     rng: CounterRng, purpose: str, random_key: RandomKey, runs: Int, correlation_s: float, *, where: Bool | None = None
 ) -> Int:
-    """(S, P) a stamp that tells the renewal in force from all others of its series, by which more can be drawn."""
+    """(S, P) a stamp of the renewal in force, unique in its series: an address under which more numbers are drawn."""
     return _draw_held(rng, purpose, random_key, runs, correlation_s, where, renewals_too=True)[1]
 
 
@@ -532,7 +532,7 @@ def list_births(
     alive_ns: tuple[int, int],
     births: tuple[Int, Int, Int, Int, Int],
 ) -> int:
-    """How many births of rows (R,) in runs (S,) live at some instant of `alive_ns` (from, and before).
+    """Count the births of rows (R,) in runs (S,) that live at some instant of `alive_ns` (from, and before).
 
     Cells from and before. `births` (B,) each: run, row, address, begin and end of each, filled as far as there is room.
     """

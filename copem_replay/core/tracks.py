@@ -104,7 +104,7 @@ class Solid(NamedTuple):
 
     @property
     def top_m(self) -> float:
-        """Above z = 0."""
+        """The height of the upper end above z = 0."""
         return self.bottom_m + self.height_m
 
     @property
@@ -345,7 +345,7 @@ class Tracks:
         return np.flatnonzero(missed) + 1
 
     def take_tracks(self, keep: Bool) -> Tracks:
-        """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
+        """Only the tracks in the mask `keep` (E,). Lists stay: one that loses all entries is an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(np.repeat(keep, np.diff(self.start))))
 
     def take_rows(self, rows: Int, *, states: bool = True) -> Tracks:
@@ -370,7 +370,7 @@ class Tracks:
         )
 
     def in_lists_of(self, other: Tracks) -> Tracks:
-        """These rows in the lists of `other`, which are the same: they take memory once."""
+        """These rows in the lists of `other`, which are equal: so both share the memory."""
         return replace(
             self,
             stamp_ns=other.stamp_ns,
@@ -475,7 +475,7 @@ STATES = (*VALUES, *_OPTIONAL)
 
 
 def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
-    """The tracks and then the others, both of one run and in the lists that both have.
+    """The tracks followed by `others`, both of one run and with the same lists.
 
     Variances that only one of them states are 0 in the other.
     """

@@ -23,12 +23,12 @@ _tell: list[Callable[[str], None]] = []
 
 
 def tell_waits(tell: Callable[[str], None]) -> None:
-    """From now on call `tell` with a line when a server lets this process wait; nothing else tells of it."""
+    """From now on call `tell` with a line whenever a server lets this process wait."""
     _tell[:] = [tell]
 
 
 def await_server(where: str, ask: Callable[[Callable[..., None]], Answer], *, works: bool = False) -> Answer:
-    """What `ask` returns or raises. It is handed a function to call whenever a byte has come.
+    """The result of `ask`, or its exception. `ask` gets a function to call whenever a byte has come.
 
     `where`: the server, in words. `works`: it may be silent for as long as `WORK_LIMIT_S`. Raises TimeoutError when it
     has been silent for too long; the thread is left behind then, and ends with the process.
