@@ -199,8 +199,8 @@ class EntriesBeside:
         self._shown = {"false": False, "second": False}
 
     def add(self, fused_tracks: FusedTracks, false: Bool) -> None:
-        """Write those of the next time chunk, `false (P,)` or not. A list without any has an empty row, if one before
-        had some.
+        """Write the entries of the next time chunk, `false (P,)` or not; an empty list gets a row if one before had
+        any.
         """
         tracks = fused_tracks.fused
         second = tracks.valid[0] & (tracks.row_object_ix < 0) & ~false
@@ -267,24 +267,20 @@ def _pack_rgba(colour: tuple[int, int, int, int]) -> int:
 
 
 def _write_boxes(
-    out: RecordingSink,
-    path: list[str],
-    tracks: Tracks,
-    extra: Callable[[Int], dict[str, Any]],
-    drawn: Bool | None = None,
+    out: RecordingSink, path: list[str], tracks: Tracks, look: Callable[[Int], dict[str, Any]], mask: Bool | None = None
 ) -> None:
     """Write the boxes of `tracks`, each list from the instant it is available.
 
-    `extra`: further columns of rows. `drawn` (P,): which are drawn, None: all.
+    `look`: further columns of rows. `mask` (P,): which are drawn, None: all.
     """
     import rerun as rr
 
-    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0] if drawn is None else drawn):
+    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0] if mask is None else mask):
         columns = rr.Boxes3D.columns(
             centers=stack_float32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
             half_sizes=stack_float32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
             rotation_axis_angles=upright_turns(tracks.yaw_rad[0, rows]),
-            **extra(rows),
+            **look(rows),
         )
         out.flush()  # so that no more than two slices are held: one is sent while the next is made
         out.columns(path, available_ns, columns.partition(counts))

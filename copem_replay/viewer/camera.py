@@ -126,7 +126,7 @@ def _story_places(replay: Replay, experiment: Experiment, stories: Mapping[int, 
 
 @dataclass(frozen=True)
 class MovingPicture:
-    """What a camera that follows shows at the instants (K,): its middle, what is ahead in its frame, how wide it is.
+    """The picture of a camera that follows, at instants (K,): its middle, what is ahead in its frame, and its width.
 
     `scale`: how many times as wide as at least. `middle`: the picture's middle as seen from what it follows, (3, K)
     ahead, left and up. `seen`: by shown object where it is in that frame; NaN while it is absent.
@@ -141,7 +141,7 @@ class MovingPicture:
     seen: Mapping[int, Float]
 
     def frames_at(self, elapsed_ns: Int) -> Int:
-        """The newest of the instants (K,) at others (R,): what the viewer shows then; the first before it."""
+        """(R,) the newest instant (K,) at other instants (R,), as the viewer shows it; the first before it."""
         rows: Int = np.maximum(np.searchsorted(self.elapsed_ns, elapsed_ns, side="right") - 1, 0)
         return rows
 
@@ -160,7 +160,7 @@ def follow_episodes(
     replay: Replay, experiment: Experiment, eye: Camera, stories: Mapping[int, tuple[float, float]],
     masts: Mapping[int, Collection[str]] = MappingProxyType({}),
 ) -> MovingPicture:  # fmt: skip
-    """What a camera that follows shows: each object during its story, together with what it follows, the ego and units.
+    """The picture of a camera that follows: each object during its story, together with the ego and units.
 
     What hides an object is between them. Stories for which the picture would be wider than `WIDEST_M` are left out, the
     first ones last. `stories`: as in `camera_on_ego`; `masts`: by object, units in the picture with it; these and the
@@ -347,14 +347,14 @@ def write_false_words(
 
 
 def find_up_rad(picture: MovingPicture | None, eye: Camera, elapsed_ns: Int) -> Float:
-    """(R,) the heading that is up in the picture at some instants; `picture`: of a turning camera."""
+    """(R,) the heading that is up in the picture at instants (R,); `picture`: of a turning camera."""
     if picture is None:
         return np.full(len(elapsed_ns), eye.heading_rad)
     return np.asarray(picture.yaw_rad[picture.frames_at(elapsed_ns)] + np.pi / 2)
 
 
 def below_bodies(body: Mapping[str, Float], up_rad: Float) -> Float:
-    """(3, …) the places on the ground just below bodies (…) in a picture, where words do not lie over them.
+    """(3, …) places on the ground just below bodies (…) in a picture, where words do not cover them.
 
     `up_rad`: the heading that is up in the picture.
     """

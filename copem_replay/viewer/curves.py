@@ -168,7 +168,7 @@ def write_known_count(
 
 
 def find_false_rows(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) -> Bool:
-    """(P,) whether each entry of one run is false: about nobody, of a measured class, in the annotated area."""
+    """Mask (P,) of the false entries of one run: about no object, of a measured class, in the annotated area."""
     scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
     false: Bool = fused.valid[0] & (fused.row_object_ix < 0)
     false &= replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)]

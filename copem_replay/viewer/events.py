@@ -151,7 +151,7 @@ def _describe_ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
 
 
 def describe_verdict(episode: Any) -> str | None:
-    """Whether the ego stays clear by braking, in words, for a row of the detections in conflict; else None."""
+    """Whether the ego stays clear by braking, in words, for a detection in conflict; else None."""
     if not getattr(episode, "conflict", False):
         return None
     return "stays clear" if episode.braking_pass else "does not stay clear"

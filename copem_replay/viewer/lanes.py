@@ -352,7 +352,7 @@ def write_list_fates(out: RecordingSink, name: str, lists: Sequence[UnitLists]) 
 
 
 def group_fates(unit_lists: UnitLists, fate: int) -> Iterator[list[int]]:
-    """Indices of the lists of one fate that share a row."""
+    """Indices of the lists that share a row, as one fate met them in sequence."""
     group: list[int] = []
     for k in np.flatnonzero(unit_lists.fate == fate).tolist():
         if group and k != group[-1] + 1:

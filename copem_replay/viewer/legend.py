@@ -94,7 +94,7 @@ def _shape_strips(name: str, x: float, y: float) -> list[list[list[float]]]:
 
 
 def legend_view() -> rrb.Spatial2DView:
-    """The legend."""
+    """The view of the legend."""
     import rerun.blueprint as rrb
 
     bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)

@@ -187,7 +187,7 @@ class _RecordingFile:
 
     @cached_property
     def picture(self) -> MovingPicture | None:
-        """What the camera on the ego shows; None: it stands still."""
+        """The picture of the camera on the ego; None: it stands still."""
         return self.content.follow(self.content.eye) if self.content.eye.turns else None
 
 
@@ -434,7 +434,7 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
 
 
 def write_with_recording(scratch: Path, results: Results, file: Path) -> tuple[Path, list[str]]:
-    """Write the run that results show of a recording again, with its images and points, into a scratch folder.
+    """Write the run shown in results again, with the recording's images and points, into a scratch folder.
 
     Returns the path, there as in the folder of results, and notes. Raises InputError where it is none of these results.
     """

@@ -206,7 +206,7 @@ class FaultsShown:
         self._shown_until_ns: dict[str, int] = {}
 
     def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
-        """Write those of the next time chunk; `run_tracks`: fused tracks by configuration."""
+        """Write the faults of the next time chunk; `run_tracks`: fused tracks by configuration."""
         candidates = [fused_tracks for fused_tracks in run_tracks.values() if fused_tracks.faults is not None]
         if not candidates:
             return

@@ -282,7 +282,7 @@ def _name_entities(ids: tuple[str, ...], classes: tuple[int, ...]) -> tuple[str,
 
 
 def make_distinct(names: Sequence[str]) -> list[str]:
-    """The names, with their index after those that occur more than once."""
+    """The names, those that occur more than once with their index."""
     twice = {name for name, count in Counter(names).items() if count > 1}
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
 
@@ -381,21 +381,21 @@ VIEWED = 7
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """The configurations of one file, and what its name has before the suffix."""
+    """The configurations of one file, and the infix of its name before the suffix."""
 
     configurations: tuple[str, ...]
     infix: str = ""
 
     def path(self, path: Path) -> Path:
-        """The path of this file; `path`: that of the first file."""
+        """The path of this part's file, derived from `path`, that of the first file."""
         return path.with_name(f"{path.stem}{self.infix}{path.suffix}")
 
 
 def split_into_files(configurations: Sequence[str], baselines: Mapping[str, str] | None = None) -> list[RecordingPart]:
     """All configurations in their order, seven per file: `replay.rrd`, `replay.configurations_8-14.rrd` and so on.
 
-    The baseline of all is in every file, and the first of it. Of several baselines each stands before what is held
-    against it, and is in the same file.
+    The baseline of all is the first in every file. Of several baselines each stands in the file of the configurations
+    that are compared with it, before them.
     """
     against = {*(baselines or {}).values()}
     shared = tuple(name for name in configurations if name in against) if len(against) == 1 else ()

@@ -50,7 +50,7 @@ OLD_S = 0.05
 
 @dataclass(frozen=True)
 class Reasons:
-    """Label over an object and sentence on its selection, for pairs (P,) of instant and object.
+    """The label over an object and the sentence on its selection, for pairs (P,) of instant and object.
 
     `number`: equal for equal sentences.
     """
