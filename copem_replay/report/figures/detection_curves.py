@@ -99,7 +99,7 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
 def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
-    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
+    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands where there are clusters."""
     weigh = results.experiment.measure.weigh
     clusters = find_clusters(results.known, weigh=weigh)
     fixed = [name for name in names if clusters is not None and clusters.by_run and results.facts[name].fixed]

@@ -65,13 +65,13 @@ class Drive:
         yield from (np.array(solid.corners_m) for solid in self.scene.solids)
 
     def lanes_within(self, west_m: float, east_m: float, south_m: float, north_m: float) -> list[Float]:
-        """Borders of lanes (K, 2) that come into a box."""
+        """Borders of lanes (K, 2) that reach into a box."""
         borders = (line[:, :2] for line in self.lanes_m)
         low, high = (west_m, south_m), (east_m, north_m)
         return [line for line in borders if (line.max(axis=0) >= low).all() and (line.min(axis=0) <= high).all()]
 
     def fixed_units(self) -> dict[str, tuple[float, float]]:
-        """Places of the units that stand."""
+        """Places of the fixed units."""
         return {name: unit.at for name, unit in self.experiment.modelled.items() if unit.at is not None}
 
 

@@ -173,7 +173,7 @@ def pivot_by_run(results: Results, column: str) -> Iterator[pd.DataFrame]:
 
 
 def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
-    """A sentence on the configurations that a figure leaves out; empty without any."""
+    """A sentence on the configurations that a figure omits; empty without any."""
     left = [short for name, short in shorten_names(names).items() if name not in shown]
     if not left:
         return ""

@@ -276,7 +276,7 @@ _NOTE = "note"
 
 
 def take_note(figure: Figure) -> str:
-    """Take the note from a figure, with the space it was in: a page has it as a text of its own. Empty without one."""
+    """Take the note and its space away from a figure, as a page shows it as text. Empty without one."""
     from matplotlib.layout_engine import PlaceHolderLayoutEngine
 
     notes = [text for text in figure.texts if text.get_gid() == _NOTE]
@@ -387,7 +387,7 @@ def write_limits(low: float, high: float) -> str:
 
 
 def describe_over(results: Results) -> str:
-    """What intervals of the results are over, what that tells and cannot exclude; empty where there are none."""
+    """What the intervals of results are over, what they show and cannot exclude; empty without any."""
     clusters = find_clusters(results.known)
     if clusters is None:
         return ""
@@ -412,7 +412,7 @@ METADATA = {
 
 
 def render_figure(figure: Figure, suffixes: Sequence[str] = tuple(METADATA)) -> dict[str, bytes]:
-    """The content of a file of each kind."""
+    """The content of one file per kind."""
     content = {}
     with figure_style(), warnings.catch_warnings():
         warnings.filterwarnings(
@@ -474,7 +474,7 @@ def find_truths(results: Results) -> tuple[str, ...]:
 
 
 def find_contenders(results: Results, names: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Those of `names` (None: all) that are not the ground truth; all of `names` if there are no others."""
+    """The configurations of `names` (None: all) that are not the ground truth; all of `names` without any other."""
     chosen, upper = results.chosen(names), find_truths(results)
     return tuple(name for name in chosen if name not in upper) or chosen
 

@@ -240,7 +240,7 @@ def _embed_figure(study: ReportData, name: str) -> Html:
 
 
 def _embed_answer(study: ReportData) -> Html:
-    """The figure of the answer, and the same with its panels stacked, of which a screen shows what it has room for."""
+    """The figure of the answer in a wide and a stacked layout; CSS shows the one that fits the screen."""
     kind, looks = FIGURES[_ANSWER], study.looks.values()
     stacked = answer_figure(study.results, stacked=True)
     take_note(stacked)  # the other one has it
