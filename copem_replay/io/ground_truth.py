@@ -70,7 +70,7 @@ class DecodedObjects:
 
 
 def take_messages(columns: DecodedObjects, keep: Bool) -> DecodedObjects:
-    """The lists of the messages `keep` (F,)."""
+    """The lists of the messages in the mask `keep` (F,)."""
     if keep.all():
         return columns
     rows = np.repeat(keep, columns.rows)
@@ -79,7 +79,7 @@ def take_messages(columns: DecodedObjects, keep: Bool) -> DecodedObjects:
 
 
 def list_contents(columns: DecodedObjects) -> list[bytes]:
-    """What each message (F,) says of its objects, as bytes: equal for equal lists."""
+    """The content of each message (F,) as bytes: equal for equal lists."""
     ends = np.cumsum(columns.rows).tolist()
     spans = [slice(end - number, end) for end, number in zip(ends, columns.rows.tolist(), strict=True)]
     return [columns.object_ix[rows].tobytes() + columns.values[rows].tobytes() for rows in spans]

@@ -57,7 +57,7 @@ _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class KnownLog:
-    """What is known of a log that was read, whether its content is in memory (`Recording`) or not."""
+    """The facts of a log that was read, whether its content is in memory (`Recording`) or not."""
 
     scene: Scene
     path: Path
@@ -71,12 +71,12 @@ class KnownLog:
 
     @property
     def place(self) -> Place:
-        """Where it lies: a file or folder, or several, or under a URL."""
+        """Its place: a file or folder, or several, or a URL."""
         return self.remote or self.local
 
     @property
     def local(self) -> Local:
-        """What it was read from on this machine."""
+        """The place on this machine that it was read from."""
         return self.path if self.together is None else self.together
 
     @property

@@ -38,7 +38,7 @@ class ListPoints:
     track: Int
 
     def thinned(self, most: int) -> ListPoints:
-        """About `most` of the entries: every n-th list, whole."""
+        """About `most` entries: every n-th list, whole."""
         every = -(-len(self.time_s) // most)
         return self.take(np.flatnonzero(self.list_ix % every == 0)) if every > 1 else self
 

@@ -178,9 +178,9 @@ def find_runs(stamp_ns: Int, log_time_ns: Int) -> Int:
 def refuse_second_run(
     stamp_ns: Int, log_time_ns: Int, list_contents: Callable[[], Sequence[bytes]], path: Path, topic: str
 ) -> None:
-    """Raises RecordingError: messages are of several runs. Repeats of a run, message by message, are none.
+    """Raises RecordingError where messages are of several runs, unless a run repeats the first message by message.
 
-    `list_contents`: gives what each message says, as bytes.
+    `list_contents`: gives the content of each message, as bytes.
     """
     run = find_runs(stamp_ns, log_time_ns)
     if not run.any():

@@ -215,7 +215,7 @@ def _find_contradicted(rows: TrackRows, judged: Bool, wrong: Bool) -> list[tuple
 
 
 def are_places(ids: Sequence[str], object_ix: Int, message: Int) -> bool:
-    """Whether ids are places in the list: the number at the end of an id is the row's place in its `message (P,)`."""
+    """Whether ids are places in the list: each ends with the row's place in its `message (P,)`."""
     numbers = np.array([int(t) if t.isdecimal() and len(t) < 9 else -1 for t in (n.rpartition("/")[2] for n in ids)])
     if not len(object_ix) or (numbers[object_ix] < 0).any():
         return False

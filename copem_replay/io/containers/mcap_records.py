@@ -99,7 +99,7 @@ class ChunkAllowance:
         self._too_large = 0
 
     def refuse(self) -> ValueError:
-        """The error for a chunk that is too large; it is counted, since work was done for it in vain."""
+        """The error for a chunk that is too large; it is counted, as it cost work in vain."""
         self._too_large += 1
         return ValueError(f"a chunk holds more than {CHUNK_LIMIT_BYTES >> 20} MiB")
 

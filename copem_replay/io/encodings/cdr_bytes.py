@@ -34,7 +34,7 @@ def put_cdr(
     out: NDArray[np.uint8], sizes: Int, program: Int, first: Int, step: Int, cells: NDArray[np.uint64],
     pool: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """The sizes of messages (N,); and their bytes, one after the other in `out`, which has zeros: if it is not empty.
+    """Sizes of messages (N,); and their bytes, one after the other in the zeroed `out`, unless it is empty.
 
     In row r column c has the cells from `first[c] + step[c] * r` on: its numbers' bits; of a text its place in `pool`
     and its length; of a list its first row and how many it has.

@@ -27,7 +27,7 @@ from copem_replay.io.decoded_size import check_decoded_bytes
 
 @dataclass(frozen=True)
 class DistinctTexts:
-    """R texts, each distinct one kept once."""
+    """R texts, each distinct one stored once."""
 
     code: Int  # (R,) index into words; −1: not said
     words: tuple[str, ...]

@@ -85,7 +85,7 @@ class Poses:
     notes: tuple[Finding, ...] = ()  # what was left out, or is not stated
 
     def take(self, rows: Int) -> Poses:
-        """Some of the poses."""
+        """The poses at these indices or in this mask."""
         names = ("stamp_ns", "position_m", "rotation", "velocity_mps", "log_time_ns")
         frame, child = (tuple(np.array(texts, dtype=object)[rows]) for texts in (self.frame, self.child))
         return replace(self, frame=frame, child=child, **{name: getattr(self, name)[rows] for name in names})

@@ -64,7 +64,7 @@ CHUNK_BYTES = 1 << 20
 CHUNKS_AHEAD = 16
 """Chunks that may be encoded before they are written: lists are encoded many at once, so that some take long."""
 _EVENT_TIMES = ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m")
-"""Columns of the detections table that the event of a detection tells of."""
+"""Columns of the detections table that are copied into each detection event."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
 RunLists = tuple[Mapping[str, FusedTracks], Sequence[ReadyLists]]
