@@ -338,9 +338,7 @@ class Crew:
         self._tell(self._progress)
 
     def _do_all(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Receipt]]:
-        """The receipts of tasks as they come. A task at which workers died is tried once more, alone: it may have died
-        of another.
-        """
+        """The receipts of tasks as they come. A task at which workers died is tried once more, alone."""
         waiting, suspects, flying = deque(tasks), deque[Task](), dict[Future[Receipt], tuple[Task, bool]]()
         self._report()
         try:

@@ -375,7 +375,7 @@ class _Panel:
         axes.text(0.97 - scale / 2, 0.055, "10 m", transform=axes.transAxes, ha="center", fontsize=7, color=_GREY)
 
     def show(self, frame: int) -> None:
-        """Draw a frame."""
+        """Draw one frame."""
         plot, knowledge, ego_ix = self._plot, self._knowledge, self._plot.replayed.replay.scene.ego_ix
         x, y = plot.centre_m[frame].tolist()
         self._axes.set_xlim(x - self._half_m[0], x + self._half_m[0])

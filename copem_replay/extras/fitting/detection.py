@@ -65,12 +65,12 @@ class DetectionMemoryFit:
 
 
 def pass_starts(pass_ix: Int) -> Int:
-    """(N + 1,) where each pass begins; its rows lie together."""
+    """(N + 1,) the first row of each pass, whose rows lie together, and the end."""
     return np.flatnonzero(np.r_[True, pass_ix[1:] != pass_ix[:-1], True])
 
 
 def build_sequences(listed: Bool, probability: Float, captured_s: Float, pass_ix: Int) -> Sequences:
-    """Hits and misses of the passes, with a few dozen different probabilities: means of those close together."""
+    """Hits and misses of the passes, with a few dozen distinct probabilities: means of close ones."""
     level = np.rint(np.arcsin(np.sqrt(probability)) * (2 * LEVELS / np.pi)).astype(np.int64)
     count = np.maximum(np.bincount(level), 1)
     return Sequences.of(
@@ -79,13 +79,13 @@ def build_sequences(listed: Bool, probability: Float, captured_s: Float, pass_ix
 
 
 def build_common_sequences(rows: FitRows, probability: Float) -> Sequences:
-    """Hits and misses of whole logs, list by list: all objects of a list share one number, as `of: unit` has it."""
+    """Hits and misses of whole logs, list by list: all objects of a list share one number, as with `of: unit`."""
     order = np.lexsort((rows.list, rows.log))
     return build_sequences(rows.listed[order], probability[order], rows.captured_s[order], rows.log[order])
 
 
 def explain_no_memory(listed: Bool, pass_ix: Int) -> str | None:
-    """Why the data do not tell how long detection lasts; None where they do."""
+    """The reason why the data do not tell how long detection lasts; None: they do."""
     passes = len(np.unique(pass_ix))
     for what, where in (("miss", ~listed), ("hit", listed)):
         if not where.any():

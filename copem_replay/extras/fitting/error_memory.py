@@ -156,14 +156,14 @@ class ResidualSeries:
         return self._last[1]
 
     def some(self, rows: int) -> Int:
-        """About so many rows: those of every n-th series."""
+        """About `most` rows: those of every n-th series."""
         series_ix = np.cumsum(self.new) - 1
         step = max(len(self.new) // rows, 1)
         return np.flatnonzero(series_ix % step == 0)
 
 
 def whiten_series(values: Float, series: ResidualSeries, shares: MemoryShares) -> tuple[Float, Float]:
-    """Columns (n, K) freed of memory, and the variance of each row given those before it (n,)."""
+    """Columns (n, K) without their memory, and the variance of each row given those before it (n,)."""
     if shares.drift == shares.constant == 0:
         return values, np.ones(len(values))
     decay = series.decay(shares.tau_s)

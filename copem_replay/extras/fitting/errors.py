@@ -83,11 +83,11 @@ class ErrorShape:
 
     @property
     def written(self) -> bool:
-        """Whether the model has Student's t."""
+        """Whether the written model is Student's t."""
         return self.heavier and self.untold is None
 
     def words(self) -> str:
-        """What the tails are like."""
+        """The tails of the errors in words."""
         if not self.heavier:
             return f"tails no heavier than a Gaussian's (excess kurtosis {self.excess_kurtosis:.2g})"
         nu = self.degrees_of_freedom

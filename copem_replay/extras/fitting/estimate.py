@@ -19,7 +19,7 @@ PER_ROW = "per row"
 
 
 def round_digits(value: float, count: int = 4) -> float:
-    """To `count` significant digits: no interval tells more."""
+    """The number rounded to `count` significant digits: no interval tells more."""
     return float(f"{value:.{count}g}")
 
 
@@ -64,7 +64,7 @@ class Estimate:
         return f"{value} (95 %: {limits}, n {self.n}{effective})"
 
     def shown(self) -> tuple[str, str]:
-        """The value and its limits with three digits, or as many as tell the limits apart."""
+        """The value and its limits with three digits, or with as many as tell the limits apart."""
         if math.isclose(self.low, self.high, rel_tol=1e-9):
             return f"{self.value:.3g}", f"the same in all {self.n}"
         digits = next((k for k in range(3, 12) if f"{self.low:.{k}g}" != f"{self.high:.{k}g}"), 3)
@@ -72,7 +72,7 @@ class Estimate:
         return value, f"{low} … {high}"
 
     def written(self, digits: int = 4) -> CommentedValue:
-        """The value as files have it, with its words as a comment."""
+        """The value in the form of files, with its words as a comment."""
         return CommentedValue(round_digits(self.value, digits), self.words())
 
 

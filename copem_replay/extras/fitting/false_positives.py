@@ -123,7 +123,7 @@ class GhostSort:
     classes: dict[str, float]
 
     def keys(self) -> dict[str, Any]:
-        """One of a PEM's `ghosts`."""
+        """The sort as an item of a PEM's `ghosts`."""
         lasts_s = self.lasts_s
         return {
             "in_list": self.in_list.written(),

@@ -82,7 +82,7 @@ def find_moved(main: Any, others: Mapping[float, Any]) -> list[str]:
 
 
 def to_plain_data(part: Any) -> Any:
-    """Anything a fit holds as plain data for JSON; NaN and infinity as null."""
+    """Any content of a fit as plain data for JSON; NaN and infinity as null."""
     if isinstance(part, float | np.floating):
         return float(part) if math.isfinite(part) else None
     if isinstance(part, np.ndarray):
@@ -198,7 +198,7 @@ class Fit:
 
 
 def judge_use(fit: Fit) -> str:
-    """What the model may be used for and what not, in one sentence."""
+    """One sentence on what the model may be used for, and what not."""
     low_m, high_m = fit.gathered.reach.range_m
     rows = fit.gathered.rows
     classes, count = np.unique(rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]], return_counts=True)
@@ -225,7 +225,7 @@ def judge_use(fit: Fit) -> str:
 
 
 def preview_fit(experiment: Experiment, recordings: Sequence[Recording], unit: str) -> tuple[str, ...]:
-    """What a fit of the recorded unit would say of its place, its delay, and its matches with the truth."""
+    """Lines on the unit's place, its delay, and its matches with the truth, as a fit would find them."""
     label = f"copem-replay fit --unit {unit}"
     try:
         check_unit(experiment, unit)

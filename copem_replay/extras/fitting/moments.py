@@ -36,7 +36,7 @@ _STRENGTHS = np.geomspace(4, 1e5, 60)
 
 @dataclass(frozen=True)
 class RangeBin:
-    """Where one covariance holds: an interval of range, and of visible share and a class where bins are split by it."""
+    """The area of one covariance: an interval of range, and of visible share and class where bins are split by it."""
 
     range_m: tuple[float, float]
     visible_share: tuple[float, float] | None = None
@@ -44,14 +44,14 @@ class RangeBin:
 
     @property
     def when(self) -> dict[str, Any]:
-        """The condition of a couple."""
+        """The area as the condition of a couple."""
         when: dict[str, Any] = {"range_m": list(self.range_m)}
         when |= {} if self.visible_share is None else {"visible_share": list(self.visible_share)}
         return when if self.of_class is None else when | {"classes": [self.of_class]}
 
     @property
     def words(self) -> str:
-        """Where it holds, in words."""
+        """The area in words."""
         low_m, high_m = self.range_m
         shares = "" if self.visible_share is None else ", visible share {:g} to {:g}".format(*self.visible_share)
         return f"{low_m:g} to {high_m:g} m{shares}{'' if self.of_class is None else f', {self.of_class}'}"

@@ -106,7 +106,7 @@ def _estimates_table(fit: Fit) -> Html:
 
 
 def _list_ladders(fit: Fit) -> dict[str, Sequence[Rung]]:
-    """The models that were compared, by what they are of."""
+    """The compared models, by the quantity they describe."""
     errors = fit.parts.errors
     return {"detection": fit.parts.detection.ladder, "errors": errors.ladder, "frame of errors": errors.frames}
 

@@ -204,11 +204,11 @@ class DelayFit:
 
     @property
     def seconds(self) -> float:
-        """The delay that is used."""
+        """The delay in use."""
         return self.estimate.value
 
     def seconds_of(self, log: str) -> float:
-        """The delay that is used for a log."""
+        """The delay in use for a log."""
         return self.of_log.get(log, self.estimate.value)
 
 

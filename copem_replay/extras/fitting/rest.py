@@ -299,7 +299,7 @@ class RestFit:
     untold: dict[str, str]
 
     def pem_keys(self) -> dict[str, Any]:
-        """Keys of a PEM beside its couples: `classes`, `ghosts`, `tracks`, and `memory` of the class."""
+        """The keys of a PEM beside its couples: `classes`, `ghosts`, `tracks`, and `memory` of the class."""
         ids, lasting = self.ids_last_s, [part.keys() for part in self.classes.memory]
         out: dict[str, Any] = {
             "classes": self.classes.keys(),
@@ -310,7 +310,7 @@ class RestFit:
         return {key: value for key, value in out.items() if value}
 
     def unit_keys(self) -> dict[str, Any]:
-        """Keys of the unit: `placed`, `outages`."""
+        """The keys of the unit: `placed`, `outages`."""
         out = {"placed": self.placed.keys(), "outages": self.list_times.keys()}
         return {key: value for key, value in out.items() if value}
 

@@ -63,7 +63,7 @@ class FitRows:
     apart: Bool | None = None
 
     def take(self, rows: Int | Bool) -> FitRows:
-        """Some rows, by index or mask."""
+        """The rows at these indices or in this mask."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else rows
         out = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         return FitRows(

@@ -55,9 +55,7 @@ class JudgedFolder:
 
 
 def read_history(folders: Sequence[Path], page: Path) -> list[JudgedFolder]:
-    """The folders of a history, in their order. Raises InputError, a line for each that cannot be read or has no
-    verdicts.
-    """
+    """The folders of a history, in their order. Raises InputError, one line per damaged one or one without verdicts."""
     judged: list[JudgedFolder] = []
     problems: list[str] = []
     seen: dict[str, Path] = {}
@@ -146,7 +144,7 @@ def _rows_of(folders: Sequence[JudgedFolder]) -> dict[_Key, list[Verdict | None]
 
 
 def find_turns(verdicts: Sequence[Verdict | None]) -> list[tuple[int, str, str]]:
-    """Where a verdict is another than in the folder before that has one: its number, the word before, and its own."""
+    """The changes of a verdict from the folder before that has one: the index, the word before, and the new word."""
     turns: list[tuple[int, str, str]] = []
     before: str | None = None
     for k, verdict in enumerate(verdicts):

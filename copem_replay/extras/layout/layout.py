@@ -35,9 +35,7 @@ _NEVER_NS = 2**62
 
 @dataclass(frozen=True)
 class ReplayContents:
-    """The content of a replay.mcap: configurations, their colours (`#rrggbb`), objects, whether the truth is drawn, and
-    the frame to follow.
-    """
+    """The scenes of a replay.mcap: configurations, colours (`#rrggbb`), objects, drawn truth, and frame to follow."""
 
     configurations: tuple[str, ...]
     colours: dict[str, str]

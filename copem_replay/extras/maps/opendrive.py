@@ -63,7 +63,7 @@ class _Reading:
     corners: int = 0
 
     def number(self, node: XmlNode, name: str, default: float | None = None) -> float:
-        """A number of an element. Raises InputError: none, where there is no default, or none that is in bounds."""
+        """A number of an element. Raises InputError: missing without a default, or out of bounds."""
         text = node.attributes.get(name, "")
         if not text.strip() and default is not None:
             return default

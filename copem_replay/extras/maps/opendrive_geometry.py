@@ -64,7 +64,7 @@ class Piece:
 
     @property
     def sharpest_per_m(self) -> float:
-        """The largest curvature; of cubics one that nobody drives in a bend."""
+        """The largest curvature, 1/m; of cubics a value sharper than any bend that is driven."""
         bends = [abs(self.numbers[name]) for name in ("curvature", "curvStart", "curvEnd") if name in self.numbers]
         return max(bends, default=0.0 if self.shape == "line" else 0.1)
 
@@ -196,9 +196,7 @@ class RoadLine:
             raise InputError(f"{self.name}: expected at most {most:,} places along a section to follow it, found more")
 
     def _split_turns(self, places: Float, most: int) -> Float:
-        """Cut stretches longer than 100 m or that turn by more than a radian: a quarter of the way might be on a chord
-        again, some circles later.
-        """
+        """Cut stretches longer than 100 m or turning by over a radian: chords of full circles would look exact."""
         starts = np.array([piece.s for piece in self.pieces])
         which = np.clip(np.searchsorted(starts, places[:-1] + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
         bends = np.array([piece.sharpest_per_m for piece in self.pieces])[which]

@@ -71,14 +71,14 @@ def check_place(lon: object, lat: object, where: str) -> Place:
 
 
 def tag_text(value: object) -> str:
-    """A value of JSON as the text of a tag: numbers as they are, true as yes, none and false as no."""
+    """The text of a tag from a JSON value: numbers as they are, true as yes, none and false as no."""
     if value is None or isinstance(value, bool):
         return "yes" if value else "no"
     return str(value)
 
 
 def parse_metres(text: str | None) -> float | None:
-    """A length: `12`, `12.5 m`, `40 ft`, `12'6"`; None: it says none."""
+    """The metres of a length: `12`, `12.5 m`, `40 ft`, `12'6"`; None: it is none."""
     said = (text or "").strip().replace(",", ".")
     if found := re.fullmatch(r"(\d{1,9}(?:\.\d*)?)\s*(m|metres?|meters?|ft|feet)?", said):
         metres = float(found[1]) * (_FOOT_M if found[2] in ("ft", "feet") else 1.0)
@@ -90,7 +90,7 @@ def parse_metres(text: str | None) -> float | None:
 
 
 def hides(tags: Tags) -> bool:
-    """Whether a shape hides what is behind it: a building above the ground, or a barrier that is not seen through."""
+    """Whether a shape blocks the view: a building above the ground, or an opaque barrier."""
     if tags.get("location") == "underground" or _number(tags.get("layer")) < 0.0:
         return False
     building = any(tags.get(name, "no") != "no" for name in ("building", "building:part"))

@@ -56,7 +56,7 @@ class Grid:
     unit_m: float
 
     def round_places(self, rows: Rows) -> Int:
-        """(R, 3) places and headings as whole numbers of 16 bits."""
+        """(R, 3) places and headings as 16-bit integers."""
         heading = np.rint(rows.yaw_rad / np.pi * FULL_TURN).astype(np.int64)
         heading = (heading + FULL_TURN) % (2 * FULL_TURN) - FULL_TURN
         east, north = (
@@ -77,7 +77,7 @@ class Rows:
     yaw_rad: Float
 
     def take(self, rows: Any) -> Rows:
-        """Some of the rows."""
+        """The rows at these indices or in this mask."""
         return Rows(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
@@ -127,7 +127,7 @@ def write_section(study: ReportData) -> tuple[str, list[Html]] | None:
 
 
 def player_element(study: ReportData) -> Html | None:
-    """The player of a run with its data; words where the log cannot be replayed again; None where no run is shown."""
+    """The player of a run with its data, or words where the log cannot be replayed; None where no run is shown."""
     results, shown = study.results, study.results.provenance.run_shown
     colours = {name: look.dark for name, look in study.looks.items()}
     names = find_differing(results, study.contenders, MOST_CONFIGURATIONS, colours)
@@ -144,7 +144,7 @@ def player_element(study: ReportData) -> Html | None:
 
 
 def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
-    """What `player.js` draws of one run. Raises CopemError where the log cannot be read or replayed again."""
+    """The data of one run for `player.js`. Raises CopemError where the log cannot be read or replayed again."""
     results = study.results
     experiment = resolve_for_log(results.experiment, choice.log)
     names = list(choice.configurations)

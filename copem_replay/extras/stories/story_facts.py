@@ -42,7 +42,7 @@ class ObjectStory:
 
     @property
     def name(self) -> str:
-        """`pedestrian 61`."""
+        """The class and id of the object: `pedestrian 61`."""
         return f"{self.rows['object_class'].iloc[0]} {self.object_id}"
 
     @property
@@ -62,7 +62,7 @@ class ObjectStory:
 
     @property
     def first(self) -> Any:
-        """The row of the configuration that knows it first; of equal ones the first."""
+        """The row of the configuration that knows it first; of equals the first one."""
         return self.rows.loc[self.rows["unknown_s"].idxmin()]
 
     @property
@@ -71,7 +71,7 @@ class ObjectStory:
         return self.rows.loc[self.rows["unknown_s"].idxmax()]
 
     def known_s(self, row: Any) -> float:
-        """When a configuration knows it; when its episode ends, if it never does."""
+        """The time from which a configuration knows it; the end of its episode, if it never does."""
         return float(row["detection_s"] if row["detected"] else row["ended_s"])
 
     @property
@@ -136,7 +136,7 @@ def unit_pose(drive: Drive, name: str, unit: Unit, world: Tracks) -> UnitPoses:
 
 
 def explain_story(story: ObjectStory) -> str:
-    """What the last configuration had of an object until it knew it, and what the first one had, in one sentence."""
+    """One sentence on how the last configuration came to know an object, and how the first one did."""
     first, last = story.first, story.last
     told = [last, first] if last["unknown_s"] - first["unknown_s"] > SAME_INSTANT_S else [last]
     return "; ".join(f"{row['configuration']}: {', '.join(_tell_row(story, row))}" for row in told) + "."

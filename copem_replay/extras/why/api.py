@@ -74,7 +74,7 @@ class Explanation:
         return [place / name for name in self.files]
 
     def blocks(self, width: int | None = None) -> Iterator[list[str]]:
-        """What is said in the terminal, part by part. `width`: None for a pipe."""
+        """The text for the terminal, part by part. `width`: None for a pipe."""
         if self.causes is not None:
             for name, rows in self.causes.groupby("configuration", sort=False):
                 yield _describe_causes(str(name), rows, width)
@@ -176,7 +176,7 @@ class _Question:
         return list(dict.fromkeys(self.configurations or with_units))
 
     def note(self, part: str, errors: Sequence[ExperimentError], has_tables: bool) -> Iterator[str]:
-        """Why a part is left out. Raises what was asked for by name and cannot be had."""
+        """The reason why a part is left out. Raises it where the part was requested by name."""
         for error in errors:
             if self.configurations is not None and (self.asked_parts is not None or not has_tables):
                 raise error

@@ -73,7 +73,7 @@ def change_pems(experiment: Experiment, change: Callable[[Pem], Pem]) -> Experim
 
 
 def change_couples(change: Callable[[Couple], Couple]) -> Callable[[Pem], Pem]:
-    """A change of PEMs that changes all their couples."""
+    """A change of PEMs that applies `change` to all their couples."""
     return lambda pem: pem.model_copy(update={"couples": tuple(map(change, pem.couples))})
 
 
@@ -203,7 +203,7 @@ _OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
 
 
 def select_configuration(experiment: Experiment, name: str) -> Experiment:
-    """The experiment with one configuration, its units and nothing that a time of detection does not need.
+    """The experiment reduced to one configuration, its units and all that a time of detection depends on.
 
     Raises ExperimentError: there is none of this name, or it is the truth, a stack's recorded output, or its times may
     begin before the onset.
@@ -239,7 +239,7 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
 
 
 def measure_times_only(experiment: Experiment) -> Experiment:
-    """The experiment with nothing that a time of detection does not need."""
+    """The experiment without all that no time of detection depends on."""
     nothing: dict[str, Any] = {"sweep": None, "show": None, "criteria": {}, "braking": None}
     measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
     return experiment.model_copy(update=nothing | {"measure": experiment.measure.model_copy(update=measure)})
@@ -250,7 +250,7 @@ def _keep(named: Mapping[str, Any], names: Container[Any]) -> dict[str, Any]:
 
 
 def list_causes(experiment: Experiment) -> list[Cause]:
-    """The causes that act in an experiment of one configuration: without each of them it is another experiment.
+    """The causes that act in an experiment of one configuration: those whose removal changes it.
 
     Raises ExperimentError for a link of the user's own, whose latency and losses cannot be told apart, and for a
     visibility of the user's own, which may hide by more than bodies.
@@ -302,16 +302,16 @@ class Counterfactuals:
 
     @cached_property
     def replay(self) -> Replay:
-        """The log as it is, made ready."""
+        """The unchanged log, prepared."""
         return self._find_ready(self.only)
 
     @cached_property
     def rows(self) -> pd.DataFrame:
-        """The rows that count, as they are: log, run, object, `unknown_s` and what else `detections.parquet` has."""
+        """The rows that count, unchanged: log, run, object, `unknown_s` and the columns of `detections.parquet`."""
         return replay_rows(self.replay, self.only)
 
     def unknown_s(self, gone: Sequence[Cause]) -> Float:
-        """(n,) seconds unknown of the rows that count without some causes; each replay is made once."""
+        """(n,) seconds unknown of the rows that count, without some causes; each set of causes is replayed once."""
         experiment = reduce(lambda changed, cause: cause.remove(changed), gone, self.only)
         (configuration,) = experiment.configurations.values()
         key = experiment.model_copy(update={"configurations": {"": configuration}}).model_dump_json()
@@ -432,7 +432,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
 
 
 def name_cause(share: CauseShares) -> str:
-    """The name of what a share is of."""
+    """The name of the cause of a share."""
     return share.cause.name
 
 

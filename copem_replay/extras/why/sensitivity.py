@@ -153,7 +153,7 @@ def _replay(recording: Recording, experiment: Experiment) -> pd.DataFrame:
 
 
 def compare_orders(varied: pd.DataFrame) -> pd.DataFrame:
-    """Of each variation the pairs of configurations whose order is another, with both differences and their errors.
+    """By variation the pairs of configurations whose order changes, with both differences and their errors.
 
     Rows: variation, better, worse (as it is), `difference_s`, `error_s` as it is, `varied_s`, `varied_error_s`, and
     `beyond`: both beyond two standard errors over the runs. A difference without an error (one run) is never beyond.
@@ -188,7 +188,7 @@ def tabulate_variations(varied: pd.DataFrame) -> pd.DataFrame:
 
 
 def describe_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
-    """A sentence for each variation: how many pairs keep their order, and which do not; none without a pair."""
+    """One sentence per variation: how many pairs keep their order, and which do not; none without a pair."""
     count = varied["configuration"].nunique()
     if count < 2:
         return []

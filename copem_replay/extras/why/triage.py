@@ -118,9 +118,9 @@ def rank_groups(groups: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_places(replay: Replay, episodes: pd.DataFrame) -> list[tuple[str, str]]:
-    """Of each row where it is, and the body that hides it most often while it is unknown; empty: none does.
+    """By row the place, and the body that hides the object most often while it is unknown; empty: none does.
 
-    Where: this body if being hidden is the cause, else the side of the ego.
+    The place is this body if being hidden is the cause, else the side of the ego.
     """
     ids = {name: number for number, name in enumerate(replay.scene.object_ids)}
     objects: Int = np.array([ids[name] for name in episodes["object_id"]], dtype=np.int64)

@@ -60,7 +60,7 @@ class UnitWorths:
 
     @property
     def table(self) -> pd.DataFrame:
-        """The rows of `units.csv`."""
+        """The worths as rows of `units.csv`."""
         columns = {"share_s": self.share_s, "alone_s": self.alone_s, "left_out_s": self.left_out_s}
         table = pd.DataFrame({"unit": self.units, **columns})
         return table.sort_values(  # units that are alike stay in their order, whatever rounding does
