@@ -210,15 +210,15 @@ def _search_interval(
 
 
 @borrowing
-def _first_touch(meeting: Meeting, clear: float, within: float) -> float:
+def _first_touch(meeting: Meeting, clear: float, reach: float) -> float:
     """Where between two places, the second in touch, the boxes first touch: by halves."""
     for _ in range(40):
-        m = (clear + within) / 2
+        m = (clear + reach) / 2
         if _distance_at(meeting, m) <= _TOUCH_M:
-            within = m
+            reach = m
         else:
             clear = m
-    return within
+    return reach
 
 
 @borrowing

@@ -292,7 +292,7 @@ def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
 
 
 def _check_swept_links(data: Mapping[str, Any], kind: str, configurations: Sequence[str]) -> Problems:
-    """Links of the swept configurations whose loss cannot be varied, or not to a value; that there are none at all."""
+    """Problems of swept links: their loss cannot be varied, or not to a value; or no link has the swept quantity."""
     varies, link_names = False, set[str]()
     for name, configuration in _items(data, "configurations"):
         link = configuration.get("link")
@@ -312,8 +312,8 @@ def _check_swept_links(data: Mapping[str, Any], kind: str, configurations: Seque
                 between = f"good_loss and bad_loss of {name} ({low:g} … {high:g})"
                 yield key, f"expected between {between}, found {value:g}"
     if not varies:
-        what = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
-        yield ("sweep", kind), what
+        fault = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
+        yield ("sweep", kind), fault
 
 
 def _fusion_kind(configuration: Mapping[str, Any]) -> str | None:

@@ -669,7 +669,7 @@ def _younger_track(tracks: NDArray[Any], i: int, j: int) -> int:
 
 @callee
 def _comes_before(unit_lists: HeardLists, f: int, g: int) -> bool:
-    """Whether list f comes before list g: see `_order_by_capture`."""
+    """Whether list f comes before list g: by capture, then the longer one, then by content, then by unit."""
     if unit_lists.captured_s[f] != unit_lists.captured_s[g]:
         return bool(unit_lists.captured_s[f] < unit_lists.captured_s[g])
     n, m = unit_lists.start[f + 1] - unit_lists.start[f], unit_lists.start[g + 1] - unit_lists.start[g]

@@ -162,16 +162,16 @@ def check_directions(rows: TrackRows, findings: list[str]) -> Float:
     values = rows.values
     stated = np.hypot(values[:, VX], values[:, VY]) > _MOVING_MPS / 2
     across = np.abs(wrap_angles(np.arctan2(values[:, VY], values[:, VX]) - course_rad)) > _ACROSS_RAD
-    for number, at, share in _find_contradicted(rows, moves & stated, across):
+    for number, instant, share in _find_contradicted(rows, moves & stated, across):
         of_object = rows.object_ix == number
-        findings += find("twist", int(of_object.sum()), id=rows.ids[number], at=at, share=share)
+        findings += find("twist", int(of_object.sum()), id=rows.ids[number], at=instant, share=share)
         values = values if values is not rows.values else values.copy()
         values[of_object, VX : VY + 1] = np.nan
     off_rad = np.abs(wrap_angles(values[:, YAW] - course_rad))
     vehicles = moves & (rows.class_ix != CLASSES.index("pedestrian")) & (rows.class_ix != CLASSES.index("animal"))
     aside = (off_rad > _ACROSS_RAD) & (off_rad < np.pi - _ACROSS_RAD)
-    for number, at, share in _find_contradicted(rows, vehicles, aside):
-        findings += find("heading", 1, id=rows.ids[number], at=at, share=share)
+    for number, instant, share in _find_contradicted(rows, vehicles, aside):
+        findings += find("heading", 1, id=rows.ids[number], at=instant, share=share)
     same, _ = _steps(rows)
     flips = same & (np.abs(wrap_angles(np.diff(values[:, YAW]))) > _FLIP_RAD) & vehicles[1:]
     for number in np.unique(rows.object_ix[1:][flips]).tolist():

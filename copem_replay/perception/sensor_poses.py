@@ -166,7 +166,7 @@ def find_grounds(truth: Tracks, outlines: Sequence[Any] | NDArray[np.object_]) -
 
 
 def _nearest_candidates(x_m: Float, y_m: Float, corners: Float) -> Int:
-    """The states (R,) that may be nearest: their distance from the corners' bounds is within the least from a corner.
+    """Indices (R,) of the states that may be nearest to a polygon: all others are farther from its bounding box.
 
     To build a geometry of a state takes most of the time, and most states are farther away.
     """

@@ -238,7 +238,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
             f"{replay.scene.log}: exact: perceived conflicts depend on sampled errors, and `brakes_for: "
             "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
         )
-    _check_truth_ids(experiment)
+    _check_known_probabilities(experiment)
     parts = []
     for name in experiment.configurations:
         columns = _exact_columns(replay, experiment, name, compute_distributions(replay, experiment, name))
@@ -248,8 +248,8 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def _check_truth_ids(experiment: Experiment) -> None:
-    """Raises ExperimentError for a configuration whose probabilities of detection are not known."""
+def _check_known_probabilities(experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration whose probabilities of detection have no closed form."""
     facts = find_facts(experiment)
     for name, configuration in experiment.configurations.items():
         recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
@@ -272,7 +272,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     """Raises ExperimentError where exact times are asked for of a configuration that has no closed form."""
     if not experiment.measure.exact:
         return
-    _check_truth_ids(experiment)
+    _check_known_probabilities(experiment)
     hits = experiment.measure.confirm.hits
     for replay in ready:
         units = replay.expand(resolve_for_log(experiment, replay.scene.log))

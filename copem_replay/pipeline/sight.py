@@ -140,7 +140,7 @@ class SpanNames(NamedTuple):
 def list_spans(
     sight: Sight, m: int, timeline: tuple[Int, ...], names: SpanNames, until_s: float, keep: int = -1
 ) -> list[StatusSpan]:
-    """The spans of object m until an instant. `keep`: as in `smooth_status`.
+    """The status spans of object m until `until_s`. `keep`: as in `smooth_status`.
 
     `timeline`: instants (K,) in ns since the log's start, and at each the status, its unit, −1: none, and the frame.
     """

@@ -96,7 +96,7 @@ class StudyLog:
         return self._whole
 
     def _check_same(self, read: Recording, key: str) -> None:
-        """Raises RecordingError where the content differs from that of the kept facts, which are then removed."""
+        """Raises RecordingError where the content differs from that of the cached facts, which are then removed."""
         if (sha := read_content_digest(read)) == self.digests["sha256"]:
             return
         if self.parts is not None and key:

@@ -269,13 +269,13 @@ def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
     if metric == "ttd_rmst_s":
         if max(map(abs, (size, *limits) if known else (size,))) < MATTERS[metric]:
             return "as soon"
-        told, known = tell_seconds(size, row.low, row.high), False
+        words, known = tell_seconds(size, row.low, row.high), False
     else:
         size, limits = (100 * size, (100 * row.low, 100 * row.high)) if "share" in metric else (size, limits)
-        told = (
+        words = (
             "±0"
             if abs(size) < NOTHING
             else f"{'+' if size > 0 else ''}{format_limit(size)}" + (" points" if "share" in metric else "")
         )
-    marks = [STAR] if row.star == STAR else [f"({why})" for why in explain_no_interval(row) if alike and told != "±0"]
-    return " ".join([told, *([format_limits(*limits)] if known and told != "±0" else []), *marks])
+    marks = [STAR] if row.star == STAR else [f"({why})" for why in explain_no_interval(row) if alike and words != "±0"]
+    return " ".join([words, *([format_limits(*limits)] if known and words != "±0" else []), *marks])

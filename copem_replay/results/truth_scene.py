@@ -32,7 +32,7 @@ _MARK_M, _ABOVE_M = 0.5, 0.05
 
 
 def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
-    """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
+    """The scene of a run's truth: static and moving entities, frame to follow. `table`: the run's detections."""
     replay, modelled = replayed.replay, replayed.experiment.modelled
     static = [*_draw_obstacles(replayed), *_draw_lanes(replayed)]
     for name, unit in modelled.items():

@@ -353,8 +353,8 @@ def errors_page(content: RecordingContent) -> rrb.Container:
     for k in content.objects:
         kinds = {"position_error": f"{content.id_of(k)}: position error, m"}
         if content.baselines:
-            less = content.baselines[0] if len(content.baselines) == 1 else "before"
-            kinds = {"error_difference": f"{content.id_of(k)}: more error than {less}, m"} | kinds
+            baseline = content.baselines[0] if len(content.baselines) == 1 else "before"
+            kinds = {"error_difference": f"{content.id_of(k)}: more error than {baseline}, m"} | kinds
         views = [
             _curves_view(make_entity_path("plots", kind, names[k]), title, content.axis(k))
             for kind, title in kinds.items()

@@ -82,10 +82,10 @@ def survey_recording(place: Local | str) -> RecordingSurvey:
             return replace(survey, reason=str(error), proposals=_list_proposals(log, survey.topics), units=units)
         survey = replace(survey, choice=str(error))
     truth, failures = [], []
-    beside = [t.topic for t in survey.topics if t.role == "unit"]
+    unit_topics = [t.topic for t in survey.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=name_log(path), topic=topic, unit_topics=beside)
+            recording = read_log(log, name=name_log(path), topic=topic, unit_topics=unit_topics)
         except RecordingError as error:
             failures.append(str(error))
             continue

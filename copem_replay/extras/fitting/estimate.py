@@ -104,6 +104,7 @@ def maximise_likelihood(
 
 
 def _climb(logp: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Float, float]:
+    """The maximum within bounds that damped Newton steps from a point reach, and its log-likelihood."""
     value, damping = logp(point), 1e-3
     for _ in range(60 if len(point) else 0):
         slope, curvature = _differentiate(logp, point, value, low, high)

@@ -213,8 +213,8 @@ class RoadLine:
         is_far = np.zeros(len(first), dtype=bool)
         for share in (0.25, 0.5, 0.75):
             s = first + share * (last - first)
-            off = self.place(s, curves(s)) - a
-            on = np.clip((off * along).sum(axis=-1) / length2, 0.0, 1.0)
-            distance2 = ((off - on[..., None] * along) ** 2).sum(axis=-1)
+            offset = self.place(s, curves(s)) - a
+            along_share = np.clip((offset * along).sum(axis=-1) / length2, 0.0, 1.0)
+            distance2 = ((offset - along_share[..., None] * along) ** 2).sum(axis=-1)
             is_far |= (distance2 > chord_m**2).reshape(-1, len(first)).any(axis=0)
         return is_far

@@ -189,31 +189,31 @@ def _explain(
     question: _Question,
     progress: Callable[[int, int], None],
 ) -> Explanation:
-    """`experiment`: over all logs; those that lack a configuration's units have no part in it."""
+    """The tables of the requested parts, and notes. `experiment`: over all logs; some may lack a configuration."""
     notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
-    known: dict[str, pd.DataFrame] = {}
-    before: dict[int, Counterfactuals] = {}
+    rows_of: dict[str, pd.DataFrame] = {}
+    latest: dict[int, Counterfactuals] = {}
     names, parts = question.select(experiment), question.parts
     if experiment.runs < _FEW_RUNS:
         few = count_noun(experiment.runs, "run")
         notes.append(f"{few}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
     steps = len(names) + ("sensitivity" in parts)
     for k, name in enumerate(names):
-        having = _select_logs(logs, [name])
-        if 0 < len(having) < len(logs):
-            log_names = ", ".join(recording.scene.log for recording, _ in having.values())
+        its_logs = _select_logs(logs, [name])
+        if 0 < len(its_logs) < len(logs):
+            log_names = ", ".join(recording.scene.log for recording, _ in its_logs.values())
             notes.append(f"{name}: of {log_names} alone; other logs lack its units")
-        explained = _explain_configuration(name, having, question, before)
+        explained = _explain_configuration(name, its_logs, question, latest)
         for part, table in explained.tables.items():
             tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
         for part, error in explained.errors.items():
             notes += question.note(part, [error], bool(explained.tables))
         if explained.rows is not None:
-            known[name] = explained.rows
+            rows_of[name] = explained.rows
         progress(k + 1, steps)
     joined = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
     common = list(_select_logs(logs, names).values())
-    varied, orders, why_not = _vary(common, names, known) if common and "sensitivity" in parts else (None, None, [])
+    varied, orders, why_not = _vary(common, names, rows_of) if common and "sensitivity" in parts else (None, None, [])
     notes += question.note("sensitivity", why_not, bool(joined))
     progress(steps, steps)
     if not joined and varied is None:
@@ -251,9 +251,9 @@ class _PartTables(NamedTuple):
 
 
 def _explain_configuration(
-    name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, before: dict[int, Counterfactuals]
+    name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, latest: dict[int, Counterfactuals]
 ) -> _PartTables:
-    """`logs`: by number; `before`: likewise the replays of the configuration before, which are replaced."""
+    """`logs`: by number; `latest`: likewise the replays of the configuration before, which are replaced."""
     from copem_replay.extras.why.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.extras.why.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.extras.why.worth import compute_unit_worths
@@ -263,7 +263,7 @@ def _explain_configuration(
         shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
         try:
             for k, (recording, experiment) in logs.items():
-                before[k] = replays = Counterfactuals(recording, experiment, name, before.get(k))
+                latest[k] = replays = Counterfactuals(recording, experiment, name, latest.get(k))
                 shares.append((replays, share_lateness(replays)))
         except ExperimentError as error:
             result.errors["causes"] = error

@@ -357,18 +357,18 @@ class Counterfactuals:
         return ready
 
     def _prepare(self, experiment: Experiment) -> Replay:
-        """The log made ready for an experiment without some causes; of what stays the same nothing is made anew."""
-        clear = experiment.visibility != self.only.visibility
+        """The log prepared for an experiment without some causes; parts that these do not change are reused."""
+        unblocked = experiment.visibility != self.only.visibility
         if experiment.units != self.only.units or experiment == self.only:
-            as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
-            base = prepare_log(self._recording, as_it_is)
+            blocked = experiment.model_copy(update={"visibility": self.only.visibility})
+            base = prepare_log(self._recording, blocked)
             base = replace(base, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
         else:
             base = self.replay
-            if experiment.pems == self.only.pems and not clear:
+            if experiment.pems == self.only.pems and not unblocked:
                 return base
         return replace(
-            base, expanded=expand_experiment(experiment, base.scene), paths_of=base if clear else base.paths_of
+            base, expanded=expand_experiment(experiment, base.scene), paths_of=base if unblocked else base.paths_of
         )
 
 

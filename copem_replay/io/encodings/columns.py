@@ -270,7 +270,7 @@ class _RawColumn:
         self._code_of: dict[bytes, int] = {}
 
     def add(self, data: bytes, bits: Any, lengths: Int, is_present: Bool) -> None:
-        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`, and where there is one."""
+        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`; which rows have a value."""
         self._said.append(is_present)
         if self._kind.is_number:
             self._values.append(_decode_numbers(bits, self._kind.how))

@@ -213,7 +213,7 @@ def _measure_frames(
     episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], params: AccuracyParameters, out: _HeldColumns,
     targets: Targets, estimates: Estimates, room: _FrameScratch,
 ) -> None:  # fmt: skip
-    # Frames `first`, `first + 1`, …, at which the lists `number` are held, −1: none.
+    # Adds the errors at frames `first`, `first + 1`, … to `out`; `number`: the list held at each, −1: none.
     reference_x_m, reference_y_m, is_placed = reference
     for q in range(len(number)):
         g, k = first + q, number[q]

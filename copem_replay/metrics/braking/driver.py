@@ -193,13 +193,13 @@ def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
     Raises InputError for an invalid probability, or one that contradicts the delays of the model.
     """
     where = "braking.driver.reaction"
-    what = "survival(delay_s)"
+    call = "survival(delay_s)"
 
     def survival(of_s: Float) -> Float | None:
         answer = ask_component(reaction, where, lambda: reaction.survival(of_s))
         if answer is None:
             return None
-        return ask_numbers(reaction, where, what, lambda: answer, of_s.shape, "probabilities 0 … 1", 1.0)
+        return ask_numbers(reaction, where, call, lambda: answer, of_s.shape, "probabilities 0 … 1", 1.0)
 
     survivals = survival(delay_s)
     if survivals is None:
@@ -214,7 +214,7 @@ def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
             k = off[0]
             raise wrong_answer_error(
                 reaction, where,
-                f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
+                f"{call}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
                 f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {probability[k]:g}", "survival",
             )  # fmt: skip
     return survivals

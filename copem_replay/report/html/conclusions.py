@@ -161,9 +161,9 @@ def _variation_sentences(study: ReportData) -> Iterator[str]:
         for kind, key in (("object", episode), ("configuration", rows["configuration"]))
     }
     pairs = [episode, rows["configuration"]]
-    of_pair = (time_s * weight).groupby(pairs).transform("sum") / weight.groupby(pairs).transform("sum")
-    apart = {kind: means - mean_s for kind, means in means_s.items()} | {"run": time_s - of_pair}
-    sd_s = {kind: float(np.sqrt(np.average(of**2, weights=weight))) for kind, of in apart.items()}
+    pair_mean_s = (time_s * weight).groupby(pairs).transform("sum") / weight.groupby(pairs).transform("sum")
+    deviations = {kind: means - mean_s for kind, means in means_s.items()} | {"run": time_s - pair_mean_s}
+    sd_s = {kind: float(np.sqrt(np.average(of**2, weights=weight))) for kind, of in deviations.items()}
     shown = [(kind, value) for kind, value in sorted(sd_s.items(), key=itemgetter(1), reverse=True) if value >= 0.005]
     if shown:
         words = (f"from {kind} to {kind} by {format_two_decimals(value)} s" for kind, value in shown)

@@ -284,7 +284,7 @@ class SumStatistic(PairStatistic):
         return np.stack(columns, axis=1), sums[~within].sum(axis=0)
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) differences. Items of no cluster stay, and the other clusters count for the one that is left out."""
+        """(K,) differences without each cluster, for which the others count. Items of no cluster stay."""
         by_cluster, always = self._sums_by_cluster(clusters)
         sums = by_cluster.sum(axis=0) - by_cluster
         if always.any():
@@ -328,7 +328,7 @@ class MedianStatistic(PairStatistic):
         return first, second, difference
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) medians of the differences."""
+        """(K,) medians of the differences without each cluster."""
         cluster, n = clusters.of(self.items), self.items.weight
         medians = [
             _weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))
@@ -370,7 +370,7 @@ class TimeStatistic(PairStatistic):
         return sides[0], sides[1], sides[0] - sides[1]
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) differences."""
+        """(K,) differences of the restricted means without each cluster."""
         K, sides = len(clusters.names), np.zeros((2, len(clusters.names)))
         for share, part in zip(self.shares, self.parts, strict=True):
             means = restricted_means_without(
