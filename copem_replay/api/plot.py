@@ -196,12 +196,12 @@ _LACKING = {
 """Why a figure cannot be drawn, where `plot` leaves it out without a word."""
 
 
-def _draw(name: str, results: AnyResults, configurations: Sequence[str] | None, **of: Any) -> Figure:
+def _draw(name: str, results: AnyResults, configurations: Sequence[str] | None, **options: Any) -> Figure:
     """A figure of the registry. Raises InputError where the results have none."""
     from copem_replay.report.figures.registry import FIGURES
     from copem_replay.report.figures.selection import Selection
 
-    read, selection = take_results(results), Selection(configurations, **of)
+    read, selection = take_results(results), Selection(configurations, **options)
     read.chosen(configurations)
     missing = FIGURES[name].missing(read, selection)
     if missing is not None and (reason := missing or _LACKING.get(name)):

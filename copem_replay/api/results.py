@@ -107,12 +107,12 @@ def judge(
     )
     assert judged is not None
     if criteria is None:
-        asked = judged.experiment.criteria
+        chosen = judged.experiment.criteria
     else:
-        asked = read_criteria(criteria if isinstance(criteria, Mapping) else Path(criteria), judged.source.data)
-    if not asked:
+        chosen = read_criteria(criteria if isinstance(criteria, Mapping) else Path(criteria), judged.source.data)
+    if not chosen:
         raise InputError(f"{judged.place}: expected criteria in its experiment, found none; --criteria FILE gives some")
-    return judge_results(judged, asked, other)
+    return judge_results(judged, chosen, other)
 
 
 def write_report(

@@ -117,11 +117,11 @@ def load_source(experiment: AnyExperiment) -> tuple[ExperimentSource, Experiment
     return read_experiment_file(Path(experiment)), None
 
 
-def _examine_source(source: ExperimentSource, given: Experiment | None) -> tuple[Experiment | None, list[str]]:
+def _examine_source(source: ExperimentSource, loaded: Experiment | None) -> tuple[Experiment | None, list[str]]:
     """The experiment, None if its keys or types are wrong, and all problems that can be found without the logs."""
-    if given is None:
+    if loaded is None:
         return find_problems(source)
-    return given, [*check_references(source), *log_paths(source)[1]]
+    return loaded, [*check_references(source), *log_paths(source)[1]]
 
 
 def make_study(
@@ -134,9 +134,9 @@ def make_study(
 
     Raises InputError with all problems of the experiment and of the recordings.
     """
-    source, given = load_source(experiment)
+    source, loaded = load_source(experiment)
     if recordings is None:
-        return read_study(source, given, survey=survey, crew=crew)
+        return read_study(source, loaded, survey=survey, crew=crew)
     listed = [recordings] if isinstance(recordings, Recording | str | PathLike) else list(recordings)
     paths = tuple(
         entry if isinstance(entry, str) and is_url(entry) else str(Path(_place_of_recording(entry))) for entry in listed
@@ -146,12 +146,12 @@ def make_study(
     source = replace_logs(source, paths, "recordings")
     objects = [entry for entry in listed if isinstance(entry, Recording)]
     if not objects:
-        return read_study(source, given, survey=survey, crew=crew)
+        return read_study(source, loaded, survey=survey, crew=crew)
     if crew is not None:
         raise InputError("crew: expected paths of recordings, for its workers read them; found recordings")
     if len(objects) < len(listed):
         raise InputError("recordings: expected either recordings or paths, found both")
-    return _check_recordings(source, given, objects)
+    return _check_recordings(source, loaded, objects)
 
 
 def _place_of_recording(recording: Recording | AnyPath) -> AnyPath:
@@ -160,7 +160,7 @@ def _place_of_recording(recording: Recording | AnyPath) -> AnyPath:
 
 def read_study(
     source: ExperimentSource,
-    given: Experiment | None = None,
+    loaded: Experiment | None = None,
     *,
     skip_unreadable: bool = False,
     survey: LogSurvey | None = None,
@@ -172,7 +172,7 @@ def read_study(
 
     Raises InputError with all problems of the experiment and of the recordings.
     """
-    experiment, problems = _examine_source(source, given)
+    experiment, problems = _examine_source(source, loaded)
     if experiment is None:
         raise ExperimentError(problems)
     places, refused_by_crew = log_paths(source)[0], dict[str, list[RefusedLog]]()
@@ -196,19 +196,19 @@ def read_study(
 
 
 def _check_recordings(
-    source: ExperimentSource, given: Experiment | None, recordings: Sequence[Recording]
+    source: ExperimentSource, loaded: Experiment | None, recordings: Sequence[Recording]
 ) -> LoadedStudy:
     """An experiment with Recording objects, checked against it. Raises InputError with all problems."""
-    experiment, problems = _examine_source(source, given)
+    experiment, problems = _examine_source(source, loaded)
     if experiment is None:
         raise ExperimentError(problems)
-    taken = list[Recording]()
+    prepared = list[Recording]()
     for recording in recordings:
-        alone = resolve_for_log(bind_logs(experiment, [recording], source), recording.scene.log)
-        problems += _describe_misread(alone, recording)
-        reasons = check_against_log(alone, recording)
+        local = resolve_for_log(bind_logs(experiment, [recording], source), recording.scene.log)
+        problems += _describe_misread(local, recording)
+        reasons = check_against_log(local, recording)
         problems += [source.at(key, f"{recording.path}: {reason}") for key, reason in reasons]
-        taken.append(take_lanes(alone, recording))
+        prepared.append(take_lanes(local, recording))
     problems += check_across_logs(experiment, recordings, source)
     names = [recording.scene.log for recording in recordings]
     if len(set(names)) < len(names):
@@ -216,7 +216,7 @@ def _check_recordings(
         problems += [f"recordings: expected each once, found {n} twice" for n in {*names} if names.count(n) > 1]
     if problems:
         raise InputError(problems)
-    recordings = tuple(replace(r, scene=replace(r.scene, log=name)) for r, name in zip(taken, names, strict=True))
+    recordings = tuple(replace(r, scene=replace(r.scene, log=name)) for r, name in zip(prepared, names, strict=True))
     return LoadedStudy(source, bind_logs(experiment, recordings, source), recordings)
 
 
@@ -227,13 +227,13 @@ def _describe_misread(experiment: Experiment, recording: Recording) -> Iterator[
     """
     way_out = "read it with read_recordings(experiment), or say so in the experiment"
     scene, topic = recording.scene, experiment.read.topic
-    found = scene.object_ids[scene.ego_ix] if scene.ego_ix >= 0 else NO_EGO
+    actual = scene.object_ids[scene.ego_ix] if scene.ego_ix >= 0 else NO_EGO
     expected = experiment.ego if isinstance(experiment.ego, str) else None
     if experiment.ego is None and recording.around is None:  # the host vehicle, which moves
         host = scene.object_number.get(recording.host_id or "", -1)
         expected = scene.object_ids[host] if host >= 0 and scene.moving[host] else NO_EGO
-    if expected is not None and expected != found:
-        yield f"{recording.path}: ego: expected {expected} as by the experiment, found {found}; {way_out}"
+    if expected is not None and expected != actual:
+        yield f"{recording.path}: ego: expected {expected} as by the experiment, found {actual}; {way_out}"
     if (experiment.window_s is None) != (recording.window is None):
         cut = "all of it" if experiment.window_s is None else f"the window {list(experiment.window_s)} s"
         yield f"{recording.path}: window_s: expected {cut} as by the experiment, found another window; {way_out}"

@@ -39,12 +39,12 @@ def list_outputs(command: Callable[..., int]) -> dict[str, OptionInfo]:
 
 def _list_parameters(command: Callable[..., int]) -> dict[str, tuple[OptionInfo | ArgumentInfo, Any]]:
     """What is said of each option and argument, and its type."""
-    found = {}
+    parameters = {}
     for name, hint in get_type_hints(command, include_extras=True).items():
         for info in getattr(hint, "__metadata__", ()):
             if isinstance(info, OptionInfo | ArgumentInfo):
-                found[name] = info, hint.__origin__
-    return found
+                parameters[name] = info, hint.__origin__
+    return parameters
 
 
 def _takes_path(hint: Any) -> bool:

@@ -173,15 +173,15 @@ def override_source(
     options: dict[Key, str] = {(name,): f"--{name}" for name in values}
     ends = {k: option for k, option in enumerate(("--from", "--to")) if window_s[k] is not None}
     if ends:
-        written = source.data.get("window_s")
-        window = written if isinstance(written, list) and len(written) == len(window_s) else [None, None]
+        stated = source.data.get("window_s")
+        window = stated if isinstance(stated, list) and len(stated) == len(window_s) else [None, None]
         values["window_s"] = [window_s[k] if k in ends else window[k] for k in range(len(window_s))]
         options |= {("window_s",): ", ".join(ends.values())} | {("window_s", k): o for k, o in ends.items()}
     if by is not None:
         measure = source.data.get("measure")
         measure = dict(measure) if isinstance(measure, dict) else {}
-        written = measure.get("by")
-        entries = list(written) if isinstance(written, list) else []
+        stated = measure.get("by")
+        entries = list(stated) if isinstance(stated, list) else []
         values["measure"] = measure | {"by": [*entries, *(entry for entry in by if entry not in entries)]}
         options |= {("measure", "by", len(entries) + k): "--by" for k in range(len(by))}
     data = drop_settings(source.data, [key for key in ("ego", "window_s") if key in values])

@@ -91,12 +91,12 @@ def _add_extra(name: str) -> None:
             """Not installed: `copem_replay/extras` lacks it."""
             load_extra("command", name)
 
-    elif isinstance(found := load_extra("command", name), typer.Typer):
-        for each in found.registered_commands:
-            each.callback = each.callback and guard_outputs(each.callback)
-        app.add_typer(found, name=name)
+    elif isinstance(command := load_extra("command", name), typer.Typer):
+        for subcommand in command.registered_commands:
+            subcommand.callback = subcommand.callback and guard_outputs(subcommand.callback)
+        app.add_typer(command, name=name)
     else:
-        app.command(name)(guard_outputs(found))
+        app.command(name)(guard_outputs(command))
 
 
 _OF_NO_GROUP = tuple(name for name in EXTRAS["command"] if name not in chain(*GROUPS.values()))

@@ -98,27 +98,27 @@ def compare(
         decide=decide,
         matters=dict(map(_parse_matters, matters or ())),
     )
-    whole = bool(explain or by is not None or matters or decide)
-    notes = list(comparison.notes) if whole else choose_notes(comparison.notes)
+    in_full = bool(explain or by is not None or matters or decide)
+    notes = list(comparison.notes) if in_full else choose_notes(comparison.notes)
     if rrd is not None:
         from copem_replay.viewer.side_by_side import write_side_by_side
 
         drawn = names if names or not comparison.newer else [*comparison.changed.configurations] or None
         notes += write_side_by_side(rrd, folders, configurations=drawn, baseline=baseline, log=log, run=run)
     if not as_json:
-        print_first_notes(notes, explain=whole)
+        print_first_notes(notes, explain=in_full)
     if comparison.newer:
-        head, told, marked = tell_change(comparison)
-        answer: tuple[str, ...] = (told,)
+        head, sentence, marked = tell_change(comparison)
+        answer: tuple[str, ...] = (sentence,)
     else:
-        alone = open_results(folders[0]) if len(folders) == 1 else None
-        decision = decide_compared(comparison) if alone is None else decide_on(alone, comparison)
+        opened = open_results(folders[0]) if len(folders) == 1 else None
+        decision = decide_compared(comparison) if opened is None else decide_on(opened, comparison)
         head, answer, marked = "", decision.sentences, decision.best
     if as_json:
         print(_format_json(comparison, " ".join(answer)))
     else:
         print_rows([head] if head else [])
-        if whole:
+        if in_full:
             print_table(comparison_text(comparison, width_of(sys.stdout)), marked)
         else:
             print_rows(*format_comparison(comparison, marked))

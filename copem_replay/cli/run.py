@@ -173,7 +173,7 @@ def _judge_results(results: Results) -> Judgement | None:
 
 
 def _read_study(
-    place: ResultsPlace, given: Sequence[Path], source: ExperimentSource, skip_unreadable: bool,
+    place: ResultsPlace, files: Sequence[Path], source: ExperimentSource, skip_unreadable: bool,
     cache: PartCache | None, cluster: str | None,
 ) -> LoadedStudy:  # fmt: skip
     """The experiment and its recordings; with `cluster` every part is computed when this returns."""
@@ -187,7 +187,7 @@ def _read_study(
 
         def read() -> LoadedStudy:
             study = read_study(source, skip_unreadable=skip_unreadable, survey=LogSurvey(cache), crew=crew)
-            check_inputs(place, [*given, *(path for log in study.logs for path in log.paths)])
+            check_inputs(place, [*files, *(path for log in study.logs for path in log.paths)])
             check_own_files(place, study.experiment, study.logs, list_exporters())
             return study
 

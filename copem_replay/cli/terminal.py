@@ -185,10 +185,10 @@ EVERY_S = 60.0
 _MINUTE_S, _HOUR_S = 60.0, 3600.0
 
 
-def show_progress(what: str, work: Callable[[Progress], T]) -> T:
+def show_progress(label: str, work: Callable[[Progress], T]) -> T:
     """The result of `work`, which reports its progress: shown as what is done, per cent and time left."""
     if sys.stderr is None or not sys.stderr.isatty():
-        return work(ProgressLines(what))
+        return work(ProgressLines(label))
     from rich.console import Console
     from rich.progress import BarColumn, Task, TextColumn
     from rich.progress import Progress as Bar
@@ -198,11 +198,11 @@ def show_progress(what: str, work: Callable[[Progress], T]) -> T:
         """The words of the last report, or that something is compiled now."""
 
         def render(self, task: Task) -> Text:
-            return Text(f"{what}: {COMPILING}") if compiling.running else super().render(task)
+            return Text(f"{label}: {COMPILING}") if compiling.running else super().render(task)
 
-    lines, console = ProgressLines(what), Console(stderr=True)
+    lines, console = ProgressLines(label), Console(stderr=True)
     with Bar(BarColumn(), Words("{task.description}"), console=console, transient=True) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(label, total=None)
 
         def show(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total, description=lines.words(done, total))

@@ -31,7 +31,7 @@ class FusionSchedule:
     arrived_start: Int
 
     def beside_newest(self) -> tuple[Int, Int]:
-        """Lists that arrive at an instant without being their unit's newest there: their instants and themselves, (B,).
+        """The lists (B,) that are not their unit's newest at the instant they arrive: their instants, and the lists.
 
         They arrive together with a newer one of their unit, or after it. Each list arrives once.
         """
@@ -118,7 +118,7 @@ def first_newer_arrival_s(arriving: Tracks) -> Float:
 
 @dataclass(frozen=True)
 class KeptEntries:
-    """The entries that the receiver keeps of units with partial messages, as lists (L,) beside those that are sent.
+    """The entries that the receiver caches of units with partial messages, as lists (L,) beside those that are sent.
 
     List l has the entries `entry[start[l] : start[l + 1]]`, each as it was sent, in messages of the unit up to `frame`.
     `newest (K, U)`: as in FusionSchedule, and F + l for list l, with F lists sent. `partial (U,)`: the units.
@@ -153,12 +153,12 @@ def keep_entries(
     """
     before = int(np.searchsorted(schedule.issue_s, instants.issue_s[0])) if len(instants.issue_s) else 0
     frame = np.repeat(np.arange(len(received.stamp_ns)), np.diff(sent.start))
-    same = np.where(partial[received.frame_unit_ix[frame]], sent.same, -1)
+    object_of = np.where(partial[received.frame_unit_ix[frame]], sent.same, -1)
     lists = _PartialLists(
         sent.start, received.frame_unit_ix, received.captured_s, received.common_arrives_s + max_age_s + SAME_INSTANT_S
     )
     columns = _keep_newest(
-        schedule.issue_s, schedule.arrived, schedule.arrived_start, before, instants.newest, lists, frame, same,
+        schedule.issue_s, schedule.arrived, schedule.arrived_start, before, instants.newest, lists, frame, object_of,
         np.flatnonzero(partial),
     )  # fmt: skip
     return KeptEntries(*columns, partial)
@@ -175,24 +175,24 @@ class _PartialLists(NamedTuple):
 
 @kernel
 def _keep_newest(
-    issue_s: Float, arrived: Int, arrived_start: Int, before: int, given: Int, lists: _PartialLists, frame: Int,
-    same: Int, units: Int,
+    issue_s: Float, arrived: Int, arrived_start: Int, before: int, known: Int, lists: _PartialLists, frame: Int,
+    object_of: Int, units: Int,
 ) -> tuple[Int, Int, Int, Int]:  # fmt: skip
     """Columns of KeptEntries: start, entry, frame, newest.
 
-    The instants `before` come first and are not asked for; `given (K, U)`: the newest list of each unit at the others.
-    `frame`, `same (N,)`: the list of each entry and the number of its object; `units`: those with partial messages.
+    `before`: how many instants come first and are left out of the result. `known (K, U)`: the newest list of each unit
+    at the others. `frame (N,)`, `object_of (N,)`: list and object number of each entry. `units`: send partial messages.
     """
-    newest, current = given.copy(), np.full(same.max() + 1 if len(same) else 0, -1)
+    newest, current = known.copy(), np.full(object_of.max() + 1 if len(object_of) else 0, -1)
     active, n = np.empty(len(current), np.int64), 0  # objects of which there is an entry
     start, entries, frames = [0], [0], [0]
     entries.pop()
     frames.pop()
-    changed, list_of = np.ones(given.shape[1], np.bool_), np.full(given.shape[1], -1)
-    for k in range(before + len(given)):
+    changed, list_of = np.ones(known.shape[1], np.bool_), np.full(known.shape[1], -1)
+    for k in range(before + len(known)):
         for f in arrived[arrived_start[k] : arrived_start[k + 1]]:
             for e in range(lists.start[f], lists.start[f + 1]):
-                i = same[e]
+                i = object_of[e]
                 if i < 0:
                     continue
                 changed[lists.unit_ix[f]] = True
@@ -211,18 +211,18 @@ def _keep_newest(
         if k < before:
             continue
         for u in units:
-            last = given[k - before, u]
+            last = known[k - before, u]
             if not changed[u] and last >= 0 and list_of[u] >= 0 and frames[list_of[u]] == last:
                 newest[k - before, u] = len(lists.unit_ix) + list_of[u]
                 continue
-            kept = [current[i] for i in active[:n] if lists.unit_ix[frame[current[i]]] == u]
-            if len(kept) == 0 and last < 0:
+            entry_ix = [current[i] for i in active[:n] if lists.unit_ix[frame[current[i]]] == u]
+            if len(entry_ix) == 0 and last < 0:
                 continue
-            for e in kept:
-                if last < 0 or (given[k - before, u] < 0 and lists.captured_s[frame[e]] > lists.captured_s[last]):
+            for e in entry_ix:
+                if last < 0 or (known[k - before, u] < 0 and lists.captured_s[frame[e]] > lists.captured_s[last]):
                     last = frame[e]
-            kept.sort()  # an order that does not depend on where a log is cut
-            entries.extend(kept)
+            entry_ix.sort()  # an order that does not depend on where a log is cut
+            entries.extend(entry_ix)
             start.append(len(entries))
             frames.append(last)
             list_of[u], changed[u] = len(frames) - 1, False

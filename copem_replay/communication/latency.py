@@ -29,7 +29,7 @@ class LatencyModel(Component, ABC):
 
     @property
     def fixed_s(self) -> float | None:
-        """What it always is; None: it is drawn."""
+        """The delay where it is always the same; None: it is drawn."""
         return None
 
 

@@ -29,7 +29,7 @@ LINKS = {"radio": "copem_replay.communication.radio:Radio"}
 
 
 class KeptDraws:
-    """What links drew for the lists of one log, run by run.
+    """Cache of the numbers that links drew for the lists of one log, run by run.
 
     Several configurations send by a link, and the columns about links use its draws again. When there is no more room
     all is forgotten, and drawn again where it is needed.
@@ -40,7 +40,7 @@ class KeptDraws:
         self._kept: dict[Hashable, list[tuple[LinkModel, tuple[Float, Bool]]]] = {}
 
     def of(self, link: LinkModel, lists: Hashable, drawn: Callable[[], tuple[Float, Bool]]) -> tuple[Float, Bool]:
-        """What a link drew for some lists of one run; the result of `drawn`, the first time."""
+        """The cached draws of a link for some lists of one run; the result of `drawn` the first time."""
         for other, draws in tuple(self._kept.get(lists, ())):
             if other == link:
                 return draws
@@ -55,7 +55,7 @@ class KeptDraws:
 
 @dataclass(frozen=True)
 class LinkInput:
-    """Further input of a link for lists (F,) in one run: random numbers, paths, and how many entries each list has.
+    """Inputs of a link for lists (F,) in one run: random numbers, paths, and the number of entries of each list.
 
     `path`, `objects`: None where no link of the experiment asks for them. `kept`: what was drawn for these lists.
     """
@@ -130,7 +130,7 @@ class ConstantLink(LinkModel):
 
 @dataclass(frozen=True)
 class UnitLinks:
-    """A link of a configuration, the units that send by it (None: all), and `where` in the experiment it stands."""
+    """A link of a configuration, the units that send by it (None: all), and `where` the experiment names it."""
 
     where: str
     link: LinkModel
@@ -139,7 +139,7 @@ class UnitLinks:
 
 @dataclass(frozen=True)
 class Delays:
-    """The delays `by_run_s (1, F)` that a link gives F lists, checked. Raises GivenError where they are no delays."""
+    """The checked delays `by_run_s (1, F)` that a link gives F lists. Raises GivenError where they are none."""
 
     by_run_s: Float
     lists: int
@@ -154,7 +154,7 @@ class Delays:
 
 
 def transmit(
-    seen: Tracks,
+    tracks: Tracks,
     links: Sequence[UnitLinks],
     received: Container[str] | None = None,
     *,
@@ -165,19 +165,19 @@ def transmit(
     A list takes the delays of all `links` that its unit sends by, one after the other. `received`: names of the units
     whose lists reach the receiver, None: all. Raises InputError, naming where a link stands, where an own one fails.
     """
-    arrives_s = seen.common_arrives_s
-    made = np.isfinite(arrives_s)  # a list that is not made is no concern of a link
+    arrives_s = tracks.common_arrives_s
+    is_made = np.isfinite(arrives_s)  # a list that is not made is no concern of a link
     for unit_link in links:
-        sent_s = np.where(made, arrives_s, seen.captured_s)
-        sent = SentLists(seen.units, seen.frame_unit_ix, seen.captured_s, sent_s, made, air, unit_link.where)
+        sent_s = np.where(is_made, arrives_s, tracks.captured_s)
+        sent = SentLists(tracks.units, tracks.frame_unit_ix, tracks.captured_s, sent_s, is_made, air, unit_link.where)
         delay_s = ask_component(unit_link.link, unit_link.where, partial(_check_delays, unit_link.link, sent))
         if unit_link.units is not None:
-            delay_s = np.where(_is_of_units(seen, unit_link.units), delay_s, 0.0)
+            delay_s = np.where(_is_of_units(tracks, unit_link.units), delay_s, 0.0)
         arrives_s = arrives_s + delay_s
-        made = made & np.isfinite(delay_s)
+        is_made = is_made & np.isfinite(delay_s)
     if received is not None:
-        arrives_s = np.where(_is_of_units(seen, received), arrives_s, np.inf)
-    return replace(seen, arrives_s=arrives_s[None])
+        arrives_s = np.where(_is_of_units(tracks, received), arrives_s, np.inf)
+    return replace(tracks, arrives_s=arrives_s[None])
 
 
 def _check_delays(link: LinkModel, sent: SentLists) -> Float:
@@ -198,23 +198,23 @@ def _is_of_units(seen: Tracks, names: Container[str]) -> Bool:
     return np.array([name in names for name in seen.units], dtype=bool)[seen.frame_unit_ix]
 
 
-def delay_until_ready(seen: Tracks, ready: Mapping[str, LatencyModel], rng: CounterRng, runs: Int) -> Tracks:
+def delay_until_ready(tracks: Tracks, ready: Mapping[str, LatencyModel], rng: CounterRng, runs: Int) -> Tracks:
     """The lists as each is ready to be sent: later by the time that its unit works on it (`ready`, by unit).
 
     Times are drawn for one run, runs (1,). Raises InputError where a model of the user's own fails.
     """
     if not ready:
-        return seen
-    arrives_s = seen.common_arrives_s.copy()
+        return tracks
+    arrives_s = tracks.common_arrives_s.copy()
     for name, model in ready.items():
-        frames = np.flatnonzero(seen.frame_unit_ix == seen.units.index(name))
+        frames = np.flatnonzero(tracks.frame_unit_ix == tracks.units.index(name))
         if model.fixed_s is not None:
             arrives_s[frames] += model.fixed_s
             continue
         of_unit = np.zeros(len(frames), dtype=np.int64)
         random_key = drop_unshared(
-            RandomKey((name,), of_unit, of_unit.astype(np.uint64), seen.stamp_ns[frames]), "unit"
+            RandomKey((name,), of_unit, of_unit.astype(np.uint64), tracks.stamp_ns[frames]), "unit"
         )
         [uniform] = rng.uniform("ready", random_key, runs)
         arrives_s[frames] += ask_delays(model, uniform, f"units.{name}.ready")
-    return replace(seen, arrives_s=arrives_s[None])
+    return replace(tracks, arrives_s=arrives_s[None])

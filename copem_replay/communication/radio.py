@@ -37,7 +37,7 @@ class RadioChannel(Frozen):
     object_bytes: Annotated[int, Field(strict=True, ge=0, le=10**9)] = 35
 
     def takes_s(self, objects: Int) -> Float:
-        """(K,) how long lists of so many objects are in the air."""
+        """(K,) seconds in the air of lists of so many objects."""
         result: Float = 8 * (self.header_bytes + self.object_bytes * objects) / (1000 * self.kbps)
         return result
 
@@ -153,9 +153,9 @@ def _keep_order(lists: SentLists, delay_s: Float) -> Float:
     return delay_s
 
 
-def _rows_by_unit(lists: SentLists, by: Float) -> Iterator[Int]:
-    """The lists that are made, unit by unit, in the order of the times `by (F,)`."""
+def _rows_by_unit(lists: SentLists, time_s: Float) -> Iterator[Int]:
+    """The lists that are made, unit by unit, in the order of the times `time_s (F,)`."""
     made: Bool = np.ones(len(lists.unit_ix), dtype=bool) if lists.made is None else lists.made
     order = np.flatnonzero(made)
-    order = order[np.lexsort((lists.captured_s[order], by[order], lists.unit_ix[order]))]
+    order = order[np.lexsort((lists.captured_s[order], time_s[order], lists.unit_ix[order]))]
     yield from np.split(order, np.flatnonzero(np.diff(lists.unit_ix[order])) + 1)

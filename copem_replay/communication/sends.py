@@ -142,13 +142,13 @@ def _keep_most(listed: ListedObjects, differences: Float, first: int, after: int
         worth[r - first] = listed.existence[r] + min(max((d[0] - SMALLEST_S) / (AGAIN_S - SMALLEST_S), 0.0), 1.0)
         worth[r - first] += min(d[1] / (2 * MOVED_M), 1.0) + min(d[2] / (2 * FASTER_MPS), 1.0)
         worth[r - first] += min(d[3] / (2 * TURNED_RAD), 1.0) + (10.0 if d[0] == np.inf else 0.0)
-    kept = np.zeros(after - first, dtype=np.bool_)
+    is_kept = np.zeros(after - first, dtype=np.bool_)
     for _ in range(most):
         best = -1
         for i in range(after - first):
-            if included[first + i] and not kept[i]:
+            if included[first + i] and not is_kept[i]:
                 alike = best >= 0 and worth[i] == worth[best]
                 if best < 0 or worth[i] > worth[best] or (alike and listed.word[first + i] < listed.word[first + best]):
                     best = i
-        kept[best] = True
-    included[first:after] &= kept
+        is_kept[best] = True
+    included[first:after] &= is_kept

@@ -29,9 +29,9 @@ class BrokenLinkRuleError(AssertionError):
     'order'
     """
 
-    def __init__(self, rule: str, kind: str, found: str) -> None:
+    def __init__(self, rule: str, kind: str, finding: str) -> None:
         self.rule = rule
-        super().__init__(f"{kind} breaks the rule {rule!r}: {LINK_RULES[rule]}. Found {found}.")
+        super().__init__(f"{kind} breaks the rule {rule!r}: {LINK_RULES[rule]}. Found {finding}.")
 
 
 def check_latency(model: LatencyModel) -> None:
@@ -98,7 +98,7 @@ def _ask_model(kind: str, answer: object, shape: tuple[int, ...], most: float) -
     return np.array(answer, dtype=float).reshape(shape[-1:])
 
 
-def _check_same(kind: str, rule: str, found: Float, expected: Float) -> None:
-    if not np.array_equal(found, expected):
-        k = int(np.argmax(found != expected))
-        raise BrokenLinkRuleError(rule, kind, f"{found[k]} in the place of {expected[k]}")
+def _check_same(kind: str, rule: str, actual: Float, expected: Float) -> None:
+    if not np.array_equal(actual, expected):
+        k = int(np.argmax(actual != expected))
+        raise BrokenLinkRuleError(rule, kind, f"{actual[k]} in the place of {expected[k]}")

@@ -84,7 +84,7 @@ def assign_pairs(row: Int, col: Int, cost: Float, n: int, m: int, partner: Int) 
 
 @callee
 def spread_component_maximum(row: Int, col: Int, value: Float, n: int, m: int) -> None:
-    """Puts the largest `value (P,)` of its connected component in the place of each pair's own."""
+    """Replace each `value (P,)` by the largest of its pair's connected component."""
     parent, top = np.empty(n, np.int64), np.empty(n)
     for i in range(n):
         parent[i], top[i] = i, -np.inf
@@ -123,14 +123,14 @@ def _augment_rows(start: Int, choice: Int, price: Float, n: int, m: int, partner
     owner = np.full(m, -1)
     length = np.full(m, np.inf)  # of the shortest path to a column so far; −inf: settled
     before = np.empty(m, np.int64)  # the row from which that path comes
-    seen, settled_length = (
+    columns, settled_length = (
         np.empty(m, np.int64),
         np.empty(m),
     )  # columns seen, the settled ones first, with their lengths
     for new in range(n):
         if start[new] == start[new + 1]:
             continue
-        done = count = 0
+        n_settled = count = 0
         i, free, reached, out, leaving = new, -1, 0.0, np.inf, new
         while True:
             # Strictly: no row gives way to a newcomer with which the total does not fall.
@@ -142,14 +142,14 @@ def _augment_rows(start: Int, choice: Int, price: Float, n: int, m: int, partner
                 path = offset + (price[k] - v[j])
                 if path < length[j]:
                     if length[j] == np.inf:
-                        seen[count] = j
+                        columns[count] = j
                         count += 1
                     length[j], before[j] = path, i
-            if done == count:
+            if n_settled == count:
                 break
-            best, j, shortest = done, -1, np.inf
-            for q in range(done, count):
-                c = seen[q]
+            best, j, shortest = n_settled, -1, np.inf
+            for q in range(n_settled, count):
+                c = columns[q]
                 path = length[c]
                 if path < shortest or (
                     path == shortest and (owner[c] < 0, -c) > (owner[j] < 0, -j)  # a free one first
@@ -157,23 +157,23 @@ def _augment_rows(start: Int, choice: Int, price: Float, n: int, m: int, partner
                     best, j, shortest = q, c, path
             if shortest >= out:
                 break
-            seen[best], seen[done] = seen[done], j
-            reached = settled_length[done] = shortest
+            columns[best], columns[n_settled] = columns[n_settled], j
+            reached = settled_length[n_settled] = shortest
             length[j] = -np.inf
-            done += 1
+            n_settled += 1
             if owner[j] < 0:
                 free = j
                 break
             i = owner[j]
         end = reached if free >= 0 else out
         u[new] = end
-        for q in range(done):
-            j = seen[q]
+        for q in range(n_settled):
+            j = columns[q]
             if owner[j] >= 0:
                 u[owner[j]] += end - settled_length[q]
                 v[j] -= end - settled_length[q]
         for q in range(count):
-            length[seen[q]] = np.inf
+            length[columns[q]] = np.inf
         # Along the path every row hands its column on to the row before.
         j = free
         if free < 0:

@@ -28,7 +28,7 @@ SHAPES = 7
 
 
 class Sign(NamedTuple):
-    """What tells a configuration apart: its colour, and the number of its marker and dash (below `SHAPES`)."""
+    """The sign of a configuration: its colour, and the number of its marker and dash (below `SHAPES`)."""
 
     colour: Rgb
     shape: int
@@ -37,17 +37,17 @@ class Sign(NamedTuple):
 def configuration_signs(
     configurations: Iterable[str], truths: Collection[str], theme: Theme = "dark"
 ) -> dict[str, Sign]:
-    """A sign per configuration, `TRUTH` for `truths` among others.
+    """One sign per configuration; `TRUTH` for the names in `truths`.
 
-    `configurations`: all of an experiment, in its order, whichever of them are shown: so each keeps its sign. Colour
-    and shape of the first are no other one's; the others take turns of seven colours and six shapes, so that 43
-    differ. Nobody tells that many by their colour: names stand beside them.
+    `configurations`: all of an experiment in its order, shown or not, so that each keeps its sign. The first has a
+    colour and a shape of its own; the others take turns of seven colours and six shapes, so that 43 differ. Nobody
+    tells so many apart by colour: names stand beside them.
     """
-    every = list(configurations)
+    names = list(configurations)
     palette = [_read_colour(digits) for digits in _PALETTES[theme].split()]
-    placed = [name for name in every if name not in truths] or every
+    placed = [name for name in names if name not in truths] or names
     signs = {name: Sign(palette[_take_turn(k, len(palette))], _take_turn(k, SHAPES)) for k, name in enumerate(placed)}
-    return {name: signs.get(name, Sign(TRUTH, 0)) for name in every}
+    return {name: signs.get(name, Sign(TRUTH, 0)) for name in names}
 
 
 def configuration_colours(

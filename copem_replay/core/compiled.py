@@ -30,17 +30,17 @@ def kernel(function: Function) -> Function:
 
 
 def borrowing_kernel(function: Function) -> Function:
-    """`kernel` for functions that make no array and return none: their arguments outlive them."""
+    """`kernel` without reference counting: it neither makes nor returns arrays, and its arguments outlive it."""
     return _compile(function, _nrt=False)
 
 
 def making_kernel(function: Function) -> Function:
-    """`kernel` for functions that make arrays and are called by borrowing ones, too."""
+    """A reference-counted `kernel`: it may make arrays, and borrowing kernels may call it."""
     return _compile(function, _nrt=True)
 
 
 def vectorised_kernel(function: Function) -> Function:
-    """`kernel` with divisions as NumPy has them. One that may raise is a branch, and such loops are not vectorised."""
+    """`kernel` with NumPy's division, which never raises: a branch that may raise would keep loops from vectorising."""
     return _compile(function, error_model="numpy")
 
 
@@ -50,12 +50,12 @@ def callee(function: Function) -> Function:
 
 
 def borrowing(function: Function) -> Function:
-    """`callee` for functions that make no array and return none: their arguments outlive them."""
+    """`callee` without reference counting: it neither makes nor returns arrays, and its arguments outlive it."""
     return _register(function, _nrt=False)
 
 
 def making(function: Function) -> Function:
-    """`callee` for functions that make arrays and are called by borrowing ones."""
+    """A reference-counted `callee`: it may make arrays, and borrowing functions may call it."""
     return _register(function, _nrt=True)
 
 
@@ -79,13 +79,13 @@ def _import_numba() -> Any:  # by kernels alone: most commands have none
 
 @dataclass
 class Compiling:
-    """Functions that were not in the cache: how many this process has begun to compile, how many it compiles now."""
+    """How many functions, not in the cache, this process has begun to compile, and how many it compiles now."""
 
     begun: int = 0
     running: int = 0
 
     def count(self, step: int) -> None:
-        """1: one begins, −1: it ends. Numba compiles under one lock."""
+        """Count a function: 1 as its compilation begins, −1 as it ends. Numba compiles under one lock."""
         self.running += step
         self.begun += step > 0
 
@@ -112,11 +112,11 @@ def _watch_compiling() -> None:
 def call_in_room(
     function: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
 ) -> Result:
-    """What the function returns, called with half a MiB for Python's frames in one piece.
+    """Call the function on a stack chunk of half a MiB for Python's frames, and return its result.
 
-    Python has frames in pieces of 16 KiB, and gives a piece back as soon as the first frame in it ends. Where calls go
-    to and fro over the end of a piece, which compiling does half a million times, each asks the system for memory.
-    Each thread has its own pieces: docs/develop/decisions/0062-compiling-asks-less.md.
+    Python allocates frames in chunks of 16 KiB and frees a chunk as soon as its first frame ends. Calls that go back
+    and forth over a chunk's end, half a million times while compiling, would each ask the system for memory. Chunks are
+    per thread: docs/develop/decisions/0062-compiling-asks-less.md
     """
     return function(*arguments, **named)
 

@@ -76,12 +76,12 @@ class Frozen(BaseModel):
             return handler(data)
         except ValidationError as error:
             items: list[Any] = error.errors(include_url=False)
-            own = [item for item in items if item["type"] == "extra_forbidden" and len(item["loc"]) == 1]
-            if not own:
+            unknown = [item for item in items if item["type"] == "extra_forbidden" and len(item["loc"]) == 1]
+            if not unknown:
                 raise
             fields = {name: of for name, of in cls.model_fields.items() if SkipJsonSchema not in map(type, of.metadata)}
             known = {"known": sorted(of.alias or name for name, of in fields.items())}
-            for item in own:
+            for item in unknown:
                 item |= {"type": UNKNOWN_KEY, "ctx": known}
             for item in items:
                 if item["type"] not in _TYPES:
@@ -113,7 +113,7 @@ class GivenError(TypeError):
 
 
 def ask_component(component: Component, where: str, work: Callable[[], T]) -> T:
-    """The answer of a component. Raises InputError where a user's own fails; a built-in one's is a defect."""
+    """A component's answer to a call. Raises InputError where a user's own fails; a built-in one's is a defect."""
     try:
         return work()
     except FAILURES as error:
@@ -125,25 +125,25 @@ def ask_component(component: Component, where: str, work: Callable[[], T]) -> T:
 
 
 def wrong_answer_error(component: Component, where: str, message: str, *methods: str) -> InputError:
-    """The error for a wrong answer of a component, with file and line of the first of these methods that is own."""
+    """The error for an invalid return value, with file and line of the first user-defined method of `methods`."""
     return InputError(f"{where}: {component.kind}: {message}{describe_source_line(type(component), *methods)}")
 
 
 def ask_numbers(
-    component: Component, where: str, call: str, answer: Callable[[], Any], shape: tuple[int, ...], said: str,
+    component: Component, where: str, call: str, answer: Callable[[], Any], shape: tuple[int, ...], expected: str,
     most: float = np.finfo(np.float64).max,
 ) -> Float:  # fmt: skip
-    """Numbers from 0 to `most` that a component answers to a call, `probability(view)`. Raises InputError for others.
+    """Numbers from 0 to `most` that a component returns for a call, `probability(view)`. Raises InputError for others.
 
-    `said`: what is expected of them.
+    `expected`: the words for what is expected.
     """
     method = call.partition("(")[0]
     numbers = ask_component(component, where, lambda: np.asarray(answer(), dtype=np.float64))
     if numbers.shape != shape:
         raise wrong_answer_error(component, where, f"{call}: expected shape {shape}, found {numbers.shape}", method)
-    beyond = ~((numbers >= 0) & (numbers <= most))
-    if beyond.any():
-        raise wrong_answer_error(component, where, f"{call}: expected {said}, found {numbers[beyond][0]}", method)
+    invalid = ~((numbers >= 0) & (numbers <= most))
+    if invalid.any():
+        raise wrong_answer_error(component, where, f"{call}: expected {expected}, found {numbers[invalid][0]}", method)
     return numbers
 
 

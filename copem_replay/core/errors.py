@@ -33,14 +33,14 @@ from copem_replay.core.waiting import await_server
 
 
 def escape_unprintable(text: str) -> str:
-    """On one line, and without what a terminal would act on: names in a recording may hold anything."""
+    """The text on one line, without characters that a terminal would act on: names in a recording may hold anything."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 MOST_LISTED = 50
-"""So many problems, or names in a message, are listed; of more it is said how many they are."""
+"""At most so many problems, or names in a message, are listed, then "and N more"."""
 _COMPARED = 100
-"""With so many names one that is not known is compared: 20 µs each, and a file may have 10 000 of both."""
+"""An unknown name is compared with at most so many known ones: 20 µs each, and a file may have 10 000 of both."""
 
 
 class CopemError(Exception):
@@ -181,13 +181,13 @@ def name_first(names: Sequence[str], most: int, room: float = math.inf) -> str:
     return next((words for words in told if len(words) <= room), told[-1] if told else "")
 
 
-def unknown_name_message(what: str, name: object, known: Iterable[str]) -> str:
+def unknown_name_message(noun: str, name: object, known: Iterable[str]) -> str:
     """A message that a name is unknown, with the likely name, or else the known ones."""
     names = list(dict.fromkeys(known))
     near = difflib.get_close_matches(str(name), names[:_COMPARED], n=1)
     more = [f"… ({len(names):,} in all)"] if len(names) > MOST_LISTED else []
     hint = f"; did you mean {near[0]}?" if near else f"; there are {', '.join([*names[:MOST_LISTED], *more]) or 'none'}"
-    return f"no {what} is named {str(name)!r}{hint}"
+    return f"no {noun} is named {str(name)!r}{hint}"
 
 
 def near_name_hint(name: str, known: Iterable[str]) -> str:
@@ -221,19 +221,19 @@ class RemoteFile:
     info: Mapping[str, Any] | None = field(default=None, compare=False)
 
     def __str__(self) -> str:
-        """Without user and query, as it may be written."""
+        """Its URL without user and query, fit to be written."""
         return strip_credentials(self.url)
 
     __repr__ = __str__
 
     @property
     def path(self) -> PurePosixPath:
-        """Its path there, from the bucket or host on."""
+        """Its path from the bucket or host on."""
         return PurePosixPath("/" + str(self).partition("://")[2])
 
     @property
     def name(self) -> str:
-        """The last part of it."""
+        """The last part of its path."""
         return self.path.name
 
     @cached_property
@@ -323,12 +323,12 @@ def check_answering(url: str, fs: Any, path: str) -> None:
         await_server(strip_credentials(url), lambda _: fs.info(path))
 
 
-def open_file_system(url: str, what: str = "") -> tuple[Any, str]:
+def open_file_system(url: str, prefix: str = "") -> tuple[Any, str]:
     """The file system of a URL, and the path of the file in it. Raises InputError that says what to install.
 
-    `what`: the beginning of the line.
+    `prefix`: the beginning of the line.
     """
-    protocol, place = url.partition("://")[0].lower(), f"{what}{strip_credentials(url)}"
+    protocol, place = url.partition("://")[0].lower(), f"{prefix}{strip_credentials(url)}"
     if "::" in url:
         raise InputError(f"{place}: expected the URL of a file, found URLs within a URL (`::`)")
     if protocol not in PROTOCOLS:
@@ -351,19 +351,19 @@ def open_file_system(url: str, what: str = "") -> tuple[Any, str]:
 
 
 @contextmanager
-def reraise_in_one_line(url: str, failed: type[CopemError] = InputError, what: str = "") -> Iterator[None]:
+def reraise_in_one_line(url: str, failed: type[CopemError] = InputError, prefix: str = "") -> Iterator[None]:
     """Raise any failure with a URL as `failed`, in one line: errors of protocols' packages share no base."""
     try:
         yield
     except CopemError:
         raise
     except FileNotFoundError:
-        raise failed(f"{what}{strip_credentials(url)}: no such file, folder or bucket") from None
+        raise failed(f"{prefix}{strip_credentials(url)}: no such file, folder or bucket") from None
     except PermissionError as error:
-        raise failed(f"{what}{strip_credentials(url)}: access is denied ({_hide_credentials(str(error))})") from None
+        raise failed(f"{prefix}{strip_credentials(url)}: access is denied ({_hide_credentials(str(error))})") from None
     except Exception as error:
         message = _hide_credentials(str(error))
-        raise failed(f"{what}{strip_credentials(url)}: {message or type(error).__name__}") from None
+        raise failed(f"{prefix}{strip_credentials(url)}: {message or type(error).__name__}") from None
 
 
 def _hide_credentials(text: str) -> str:
@@ -380,10 +380,10 @@ def hide_credentials(text: str) -> str:
     if ":/" not in text:
         return text
 
-    def strip(found: re.Match[str]) -> str:
-        begin, rest = found[1], found[2]
+    def strip(match: re.Match[str]) -> str:
+        begin, rest = match[1], match[2]
         if not begin.endswith("//") and begin.removesuffix(":/").lower() not in PROTOCOLS:
-            return found[0]  # `rsu:/objects`: a topic
+            return match[0]  # `rsu:/objects`: a topic
         end = rest[len(rest.rstrip(".,;:")) :]  # of the sentence around it
         whole = strip_credentials(f"{begin.rstrip('/')}//{rest.removesuffix(end)}")
         return begin + whole.partition("://")[2] + end
@@ -398,7 +398,7 @@ FAILURES = (Exception, SystemExit)
 
 
 def is_own(component: type[Any]) -> bool:
-    """Whether a class is a user's own, not built in."""
+    """Whether a class is the user's, not built in."""
     return not component.__module__.startswith("copem_replay.")
 
 

@@ -82,12 +82,12 @@ def avoid_device_name(name: str) -> str:
     return f"%{ord(name[0]):02X}{name[1:]}" if _DEVICES.fullmatch(name) else name
 
 
-def _encode(found: re.Match[str]) -> str:
-    return f"%{ord(found[0]):02X}"
+def _encode(match: re.Match[str]) -> str:
+    return f"%{ord(match[0]):02X}"
 
 
 def hidden_name(name: str) -> str:
-    """`.NAME`, the beginning of names of temporary files beside NAME; of a very long name its start and its digest."""
+    """`.NAME`, with which temporary files beside NAME begin; of a very long name, its start and its digest."""
     encoded = os.fsencode(name)
     if len(encoded) <= _LONGEST:
         return f".{name}"
@@ -95,7 +95,7 @@ def hidden_name(name: str) -> str:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file or folder has a name that is given until it is complete."""
+    """Whether a file or folder has a temporary name, which it bears until it is complete."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
@@ -106,23 +106,23 @@ def find_scratch_names(folder: Path) -> list[str]:
     return []
 
 
-def list_names(folder: Path, at: str = "") -> Iterator[str]:
-    """Files, links and empty folders in a folder, by names relative to it; `at` comes before them. Raises OSError.
+def list_names(folder: Path, prefix: str = "") -> Iterator[str]:
+    """Files, links and empty folders in a folder, by names relative to it; `prefix` comes before them. Raises OSError.
 
     Temporary files are left out: they are of commands that run now, or were killed.
     """
     entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    if at and not entries:
-        yield at.removesuffix("/")
+    if prefix and not entries:
+        yield prefix.removesuffix("/")
     for entry in entries:
         if _is_unfinished(entry):
             continue
         if not entry.is_dir(follow_symlinks=False):
-            yield at + entry.name
+            yield prefix + entry.name
         elif os.path.ismount(entry.path):
             raise OutputError(f"{entry.path}: a mount point cannot be replaced; choose another folder with --out")
         else:
-            yield from list_names(Path(entry.path), f"{at}{entry.name}/")
+            yield from list_names(Path(entry.path), f"{prefix}{entry.name}/")
 
 
 def _is_unfinished(entry: os.DirEntry[str]) -> bool:
@@ -131,7 +131,7 @@ def _is_unfinished(entry: os.DirEntry[str]) -> bool:
 
 
 def check_parent(path: Path, look: Callable[[Path], object] = os.lstat) -> None:
-    """Raise OutputError where a path cannot be written, as far as the folder shows it that it is, or would be, in."""
+    """Raise OutputError where `path` cannot be written, as far as its folder, present or future, shows it."""
     try:
         parent = next((place for place in Path(os.path.abspath(path)).parents if place.exists()), Path("/"))
         with suppress(FileNotFoundError, NotADirectoryError):
@@ -150,7 +150,7 @@ def check_parent(path: Path, look: Callable[[Path], object] = os.lstat) -> None:
 
 
 def may_be_moved(folder: Path) -> bool:
-    """Whether another folder may take the name of this one: no mount point, and not where this process works."""
+    """Whether another folder may replace this one: it is no mount point, and not the working folder of this process."""
     here = Path.cwd()
     return not os.path.ismount(folder) and folder not in (here, *here.parents)
 
@@ -159,7 +159,7 @@ def may_be_moved(folder: Path) -> bool:
 
 
 def try_lock(fd: int) -> bool | None:
-    """Whether the lock of an open file is now this process's. None: the system, or the file system, has no locks."""
+    """Lock an open file; whether this process has the lock now. None: the system, or the file system, has no locks."""
     if fcntl is None:
         return _try_lock_byte(fd)
     try:
@@ -184,14 +184,14 @@ def _try_lock_byte(fd: int) -> bool | None:
 
 
 def overwrite_file(fd: int, content: bytes) -> None:
-    """Make this the content of an open file. Raises OSError."""
+    """Replace the content of an open file. Raises OSError."""
     os.lseek(fd, 0, os.SEEK_SET)
     os.write(fd, content)
     os.ftruncate(fd, len(content))
 
 
 def is_still(path: Path, fd: int) -> bool:
-    """Whether an open file is still the one of this name."""
+    """Whether `name` still names this open file."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(fd), os.lstat(path))
     return False
@@ -220,7 +220,7 @@ def _create_locked(prefix: Path, suffix: str = "", *, folder: bool = False) -> t
 
 @contextmanager
 def atomic_file(path: Path, *, flush: bool = True) -> Iterator[Path]:
-    """The path to write `path` at: it gets its name when all went well, and is removed when anything did not.
+    """The path to write `path` at: it is renamed when all went well, and removed otherwise.
 
     Missing folders are made. `flush`: it is on the disk before it has its name. Raises OutputError when it cannot be
     written.
@@ -262,7 +262,7 @@ class ScratchFolder:
 
     @property
     def old(self) -> Path:
-        """What was under the final name, once it is replaced."""
+        """The replaced folder, once the new one has the final name."""
         return self.path / "old"
 
     def may_remove(self, files: Iterable[str]) -> None:
@@ -275,7 +275,7 @@ class ScratchFolder:
 
 @contextmanager
 def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[ScratchFolder]:
-    """A scratch folder for what is to become `path`, beside it or in `place`; removed in the end. Raises OSError."""
+    """A scratch folder for the future `path`, beside it or in `place`; removed in the end. Raises OSError."""
     scratch = ScratchFolder(*_create_locked((place or path.parent) / hidden_name(path.name), folder=True))
     try:
         scratch.new.mkdir()
@@ -290,40 +290,40 @@ def make_scratch_folder(path: Path, place: Path | None = None) -> Iterator[Scrat
 
 
 def replace_folder(
-    scratch: ScratchFolder, folder: Path, list_others: Callable[[Path], Collection[str]], seen: os.stat_result
+    scratch: ScratchFolder, folder: Path, list_others: Callable[[Path], Collection[str]], old_stat: os.stat_result
 ) -> list[str] | None:
     """Put the new folder in the place of `folder`, with the files of it that `list_others` names: the user's own.
 
     They are linked into the new folder before it has its name; those that cannot be, or come meanwhile, are moved after
     that. Between two renames there is no folder of the name: of a process that is killed there, `remove_leftovers` puts
     the old one back. Returns a line for each file that stays in the scratch folder; None: nothing is replaced, because
-    the folder is no longer the one `seen`. Raises OSError.
+    the folder is no longer the one `old_stat`. Raises OSError.
     """
     new, old, linked = scratch.new, scratch.old, list(list_others(folder))
     for name in linked:
         with suppress(OSError):
             _move_over(name, folder, new, lambda source, target: os.link(source, target, follow_symlinks=False))
-    new.chmod(stat.S_IMODE(seen.st_mode))
+    new.chmod(stat.S_IMODE(old_stat.st_mode))
     flush_all(new)
     os.rename(folder, old)
     try:
-        if same := os.path.samestat(old.stat(), seen):
+        if is_same := os.path.samestat(old.stat(), old_stat):
             os.rename(new, folder)
     except BaseException:
         os.rename(old, folder)
         raise
-    if not same:
+    if not is_same:
         os.rename(old, folder)
         return None
     flush_file(folder.parent)
-    stay = {}
+    staying = {}
     for name in list_others(old):
         try:
             _move_over(name, old, folder, os.rename)
         except OSError as error:
-            stay[name] = f"{name}: cannot be moved over ({error.strerror}); it is in {old}"
-    scratch.may_remove(set(list_names(old)).difference(stay))
-    return list(stay.values())
+            staying[name] = f"{name}: cannot be moved over ({error.strerror}); it is in {old}"
+    scratch.may_remove(set(list_names(old)).difference(staying))
+    return list(staying.values())
 
 
 def _move_over(name: str, old: Path, new: Path, move: Callable[[Path, Path], None]) -> None:
@@ -389,7 +389,7 @@ def _replace_each(new: Path, folder: Path, names: Sequence[str]) -> None:
 
 
 def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
-    """Remove what killed processes left of `path` beside it, or in `place`. Returns notes for the user.
+    """Remove temporary files of `path` that killed processes left beside it, or in `place`. Returns notes for the user.
 
     A folder that one of them had moved away, to put another in its place, gets its name back.
     """
@@ -402,26 +402,26 @@ def remove_leftovers(path: Path, place: Path | None = None) -> list[str]:
     return notes
 
 
-def _remove_leftover(left: Path, path: Path) -> list[str]:
+def _remove_leftover(leftover: Path, path: Path) -> list[str]:
     """Remove a file or folder that may have been left; returns notes for the user. Raises OSError."""
     notes = []
-    with _hold_lock(left) as free:
+    with _hold_lock(leftover) as free:
         if not free:
             return []
-        if (left / "old").is_dir() and not os.path.lexists(path):
-            os.rename(left / "old", path)
+        if (leftover / "old").is_dir() and not os.path.lexists(path):
+            os.rename(leftover / "old", path)
             notes.append(f"{path}: put back, as a run was killed that was about to replace it")
-        if _clear(left, path):
-            return [*notes, f"{left}: removed, left by a process that was killed"]
-    return [*notes, f"{left}: left by a process that was killed, and not removed: it holds what is not ours"]
+        if _clear(leftover, path):
+            return [*notes, f"{leftover}: removed, left by a process that was killed"]
+    return [*notes, f"{leftover}: left by a process that was killed, and not removed: it holds what is not ours"]
 
 
 @contextmanager
-def _hold_lock(left: Path) -> Iterator[bool]:
+def _hold_lock(leftover: Path) -> Iterator[bool]:
     """Hold the lock of a temporary file or scratch folder, if it is free. A folder that has none yet is free."""
-    is_folder = left.is_dir() and not left.is_symlink()
+    is_folder = leftover.is_dir() and not leftover.is_symlink()
     try:
-        fd = os.open(left / MANIFEST if is_folder else left, os.O_RDWR | NO_LINK)
+        fd = os.open(leftover / MANIFEST if is_folder else leftover, os.O_RDWR | NO_LINK)
     except FileNotFoundError:
         yield True
         return
@@ -435,30 +435,30 @@ def _hold_lock(left: Path) -> Iterator[bool]:
             os.close(fd)
 
 
-def _clear(left: Path, path: Path) -> bool:
+def _clear(leftover: Path, path: Path) -> bool:
     """Remove a temporary file; of a scratch folder what its list names, links to files in `path`, and what killed
     processes left in it. True where nothing is left. Raises OSError.
     """
-    if left.is_file():
-        left.unlink()
+    if leftover.is_file():
+        leftover.unlink()
         return True
-    if not os.path.lexists(left / MANIFEST):  # killed before it had a list, or about to get one
+    if not os.path.lexists(leftover / MANIFEST):  # killed before it had a list, or about to get one
         with suppress(OSError):
-            left.rmdir()
-        return not left.exists()
-    listed = _read_scratch_list(left)
-    for place, folders, files in os.walk(left, topdown=False):
-        for each in (Path(place, name) for name in (*files, *folders)):
-            inside = "/".join(each.relative_to(left).parts[1:])
-            if each.is_dir() and not each.is_symlink():
+            leftover.rmdir()
+        return not leftover.exists()
+    listed = _read_scratch_list(leftover)
+    for place, folders, files in os.walk(leftover, topdown=False):
+        for item in (Path(place, name) for name in (*files, *folders)):
+            relative = "/".join(item.relative_to(leftover).parts[1:])
+            if item.is_dir() and not item.is_symlink():
                 with suppress(OSError):
-                    _remove_leftover(each, path) if os.path.lexists(each / MANIFEST) else each.rmdir()
-            elif inside and (inside in listed or is_temporary(each.name) or _are_links(each, path / inside)):
-                each.unlink()
-    if os.listdir(left) == [MANIFEST]:
-        (left / MANIFEST).unlink()
-        left.rmdir()
-    return not left.exists()
+                    _remove_leftover(item, path) if os.path.lexists(item / MANIFEST) else item.rmdir()
+            elif relative and (relative in listed or is_temporary(item.name) or _are_links(item, path / relative)):
+                item.unlink()
+    if os.listdir(leftover) == [MANIFEST]:
+        (leftover / MANIFEST).unlink()
+        leftover.rmdir()
+    return not leftover.exists()
 
 
 def _read_scratch_list(scratch: Path) -> set[str]:
@@ -475,7 +475,7 @@ def _are_links(place: Path, other: Path) -> bool:
 
 
 def flush_all(folder: Path) -> None:
-    """Flush a folder and all that is in it to the disk. Raises OSError."""
+    """Flush a folder and its content to the disk. Raises OSError."""
     for place, _, names in os.walk(folder):
         for name in names:
             if stat.S_ISREG(os.lstat(file := os.path.join(place, name)).st_mode):

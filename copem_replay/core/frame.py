@@ -30,7 +30,7 @@ _EARTH_RADIUS_M: Final = 6_371_000.0
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a log's metres are: `proj` is what PROJ knows, such as EPSG:25832, and was checked by `make_frame`."""
+    """The frame of a log's metres: `proj` is a text that PROJ reads, such as EPSG:25832, checked by `make_frame`."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -67,7 +67,7 @@ class Frame:
         return np.column_stack([c * x + s * y, c * y - s * x])
 
     def take(self, other: Frame, points_m: Any) -> Places:
-        """Places of this log (N, 2) of places of another frame (N, 2); of one projection without rounding of PROJ.
+        """Places of this log (N, 2) from places of another frame (N, 2); of one projection without rounding of PROJ.
 
         Raises InputError where one of them does not reach a place.
         """
@@ -135,7 +135,7 @@ def make_frame(proj: str, offset_m: tuple[float, float] = (0.0, 0.0), yaw_rad: f
 
 
 class SaidPlace(NamedTuple):
-    """What a recording or a map says of its place. `changed`: how it changes within a recording, "": it does not."""
+    """The place that a recording or a map states. `changed`: how it changes within a recording, "": it does not."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -176,19 +176,19 @@ def _check_words(text: str) -> tuple[str, list[str]]:
 def _check_crs(text: str) -> None:
     """Raises InputError where a projection does not give metres east and north."""
     crs = _crs(text)
-    what = ""
+    fault = ""
     if crs.is_geographic or crs.is_geocentric or not crs.is_projected:
-        what = f"{'degrees' if crs.is_geographic else 'no projection'} ({crs.name})"
+        fault = f"{'degrees' if crs.is_geographic else 'no projection'} ({crs.name})"
     elif odd := [axis for axis in crs.axis_info if axis.unit_conversion_factor != 1.0]:
-        what = f"{odd[0].unit_name} ({crs.name})"
+        fault = f"{odd[0].unit_name} ({crs.name})"
     elif odd := [axis for axis in crs.axis_info if axis.direction.lower() not in ("east", "north", "up")]:
-        what = f"an axis to the {odd[0].direction} ({crs.name})"
-    if what:
-        raise InputError(f"{text!r}: expected a projection to metres east and north, found {what}")
+        fault = f"an axis to the {odd[0].direction} ({crs.name})"
+    if fault:
+        raise InputError(f"{text!r}: expected a projection to metres east and north, found {fault}")
 
 
 def check_scale(frame: Frame, middle_m: Places) -> Iterator[str]:
-    """A note where a metre of the projection is none on the ground. Raises InputError where it is far from one."""
+    """A note where a projected metre differs from one on the ground. Raises InputError where it differs much."""
     lat, lon = frame.to_wgs84(middle_m)[0]
     if not (math.isfinite(lat) and math.isfinite(lon)):
         raise InputError(f"{frame.proj}: the log's places, with the offset, are nowhere on earth: is it `offset_m`?")
@@ -243,7 +243,7 @@ def _projection(text: str) -> Any:
 
 
 def make_local_proj(lat: float, lon: float) -> str:
-    """A transverse Mercator projection with its origin at a place, scale 1: metres east and north of it."""
+    """A transverse Mercator projection with origin at a place, scale 1: metres east and north of it."""
     return f"+proj=tmerc +lat_0={lat!r} +lon_0={lon!r} +k=1 +datum=WGS84 +units=m"
 
 
@@ -258,26 +258,26 @@ def read_mgrs(square: str) -> tuple[str, tuple[float, float]]:
 
     Raises InputError where there is no such square. Source: NGA.STND.0037, appendix B.
     """
-    found = re.fullmatch(r"(\d{1,2})([C-HJ-NP-X])([A-HJ-NP-Z])([A-HJ-NP-V])", square.upper())
-    if found is None or not 1 <= int(found[1]) <= 60:
+    match = re.fullmatch(r"(\d{1,2})([C-HJ-NP-X])([A-HJ-NP-Z])([A-HJ-NP-V])", square.upper())
+    if match is None or not 1 <= int(match[1]) <= 60:
         raise InputError(f"expected a square of MGRS such as 54SUE, found {square!r}")
-    zone, band = int(found[1]), _BANDS.index(found[2])
-    column = _COLUMNS[(zone - 1) % 3].find(found[3])
+    zone, band = int(match[1]), _BANDS.index(match[2])
+    column = _COLUMNS[(zone - 1) % 3].find(match[3])
     if column < 0:
         raise InputError(
             f"expected a square of MGRS, found {square!r}: zone {zone} has columns {_COLUMNS[(zone - 1) % 3]}"
         )
-    row_m = (_ROWS.index(found[4]) - (0 if zone % 2 else 5)) % 20 * _SQUARE_M
+    row_m = (_ROWS.index(match[4]) - (0 if zone % 2 else 5)) % 20 * _SQUARE_M
     south_deg = -80 + 8 * band
     proj = f"+proj=utm +zone={zone}{' +south' * (south_deg < 0)} +datum=WGS84 +units=m"
-    north_deg = min(south_deg + (12 if found[2] == "X" else 8), 84)
+    north_deg = min(south_deg + (12 if match[2] == "X" else 8), 84)
     meridian = 6 * zone - 183
     low_m, high_m = (Frame(proj).from_wgs84([lat, meridian])[0, 1] for lat in (south_deg, north_deg))
     rows = [row_m + k * 2_000_000.0 for k in range(6)]
     north_m = next((at_m for at_m in rows if low_m - 1.5 * _SQUARE_M < at_m < high_m + _SQUARE_M / 2), None)
     if north_m is None:
         raise InputError(
-            f"expected a square of MGRS, found {square!r}: band {found[2]} has no row {found[4]} in that zone"
+            f"expected a square of MGRS, found {square!r}: band {match[2]} has no row {match[4]} in that zone"
         )
     return proj, ((column + 1) * _SQUARE_M, north_m)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class EntrySources(NamedTuple):
-    """Entries of units' lists, `valid (S, P)` and else (P,), and those that make up each fused row: see FusedTracks."""
+    """Entries of units' lists, `valid (S, P)` and else (P,), and the entries of each fused row: see FusedTracks."""
 
     valid: Bool
     captured_s: Float
@@ -121,7 +121,7 @@ class FusedTracks:
 
     @property
     def sources(self) -> EntrySources:
-        """What the rows are made of, for compiled code."""
+        """The entries of each row as arrays, for compiled code."""
         received = self.received
         arrives_s = received.common_arrives_s[received.frame_ix]
         return EntrySources(
@@ -137,22 +137,22 @@ class FusedTracks:
         return place
 
     def names_of(self, scene: Scene) -> tuple[list[str], Int]:
-        """Names, and (P,) which of them is each row's.
+        """Names, and (P,) the index of each row's name.
 
         The id of the object a row is about, else the fusion's own identity for it, else its place in its list.
         """
-        which = self.fused.row_object_ix.copy()
-        unknown = np.flatnonzero(which < 0)
+        name_ix = self.fused.row_object_ix.copy()
+        unknown = np.flatnonzero(name_ix < 0)
         track_id = np.full(len(unknown), -1) if self.said is None else self.said["track_id"][unknown]
         tracks, track = np.unique(track_id[track_id >= 0], return_inverse=True)
-        which[unknown] = len(scene.object_ids) + len(tracks) + self._place[unknown]
-        which[unknown[track_id >= 0]] = len(scene.object_ids) + track
+        name_ix[unknown] = len(scene.object_ids) + len(tracks) + self._place[unknown]
+        name_ix[unknown[track_id >= 0]] = len(scene.object_ids) + track
         longest = int(np.diff(self.fused.by_frame[1]).max(initial=0))
         names = (*scene.object_ids, *(f"track:{t}" for t in tracks), *(f"entry:{k}" for k in range(longest)))
-        return list(names), which
+        return list(names), name_ix
 
     def class_of(self, scene: Scene) -> Int:
-        """(P,) index into CLASSES: the true one, or what the fusion takes it for."""
+        """(P,) index into CLASSES: the true class, or the most probable one by the fusion."""
         if self.said is not None:
             likely: Int = most_probable_classes(self.said["class_probability"])
             return likely
@@ -167,7 +167,7 @@ class FusedTracks:
         return order[valid], np.concatenate([[0], np.cumsum(valid)])[bounds]
 
     def listed(self, frame: int) -> list[int]:
-        """Rows of `fused` that are in one list."""
+        """Rows of `fused` that are in list `frame` of the first run."""
         rows, bounds = self.listed_rows
         result: list[int] = rows[bounds[frame] : bounds[frame + 1]].tolist()
         return result

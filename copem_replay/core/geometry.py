@@ -29,13 +29,13 @@ def _corner_distance2(
 
     The box lies at (x, y), turned by an angle with cosine c and sine s, and has the half sizes al and aw.
     """
-    apart = abs(x) > bl + abs(c) * al + abs(s) * aw or abs(y) > bw + abs(s) * al + abs(c) * aw
+    is_apart = abs(x) > bl + abs(c) * al + abs(s) * aw or abs(y) > bw + abs(s) * al + abs(c) * aw
     best = np.inf
     for u, v in ((al, aw), (al, -aw), (-al, -aw), (-al, aw)):
         dx = max(abs(x + c * u - s * v) - bl, 0.0)
         dy = max(abs(y + s * u + c * v) - bw, 0.0)
         best = min(best, dx * dx + dy * dy)
-    return best, apart
+    return best, is_apart
 
 
 @borrowing
@@ -55,14 +55,14 @@ def box_distance(ax: float, ay: float, ayaw: float, al: float, aw: float,
 
 @borrowing
 def count_below(values: Float, value: float) -> int:
-    """How many of ascending numbers are below a value, of NaN all: what `np.searchsorted` gives, compiled sooner."""
-    first, left = 0, len(values)
-    while left > 0:
-        half = left // 2
+    """How many ascending numbers are below a value, for NaN all: as `np.searchsorted`, but compiled sooner."""
+    first, remaining = 0, len(values)
+    while remaining > 0:
+        half = remaining // 2
         if values[first + half] >= value:
-            left = half
+            remaining = half
         else:
-            first, left = first + half + 1, left - half - 1
+            first, remaining = first + half + 1, remaining - half - 1
     return first
 
 
@@ -210,15 +210,15 @@ def _search_interval(
 
 
 @borrowing
-def _first_touch(meeting: Meeting, clear: float, within: float) -> float:
+def _first_touch(meeting: Meeting, clear: float, reach: float) -> float:
     """Where between two places, the second in touch, the boxes first touch: by halves."""
     for _ in range(40):
-        m = (clear + within) / 2
+        m = (clear + reach) / 2
         if _distance_at(meeting, m) <= _TOUCH_M:
-            within = m
+            reach = m
         else:
             clear = m
-    return within
+    return reach
 
 
 @borrowing
@@ -263,11 +263,11 @@ def rotated_iou(
     if not (area0 > 0.0 and area1 > 0.0 and dx * dx + dy * dy < reach * reach):
         return 0.0
     if (l0, w0, yaw0, x0, y0) < (l1, w1, yaw1, x1, y1):  # which box is cut does not depend on their order
-        both = _intersection_area(dx, dy, yaw0, l0, w0, yaw1, l1, w1)
+        overlap = _intersection_area(dx, dy, yaw0, l0, w0, yaw1, l1, w1)
     else:
-        both = _intersection_area(-dx, -dy, yaw1, l1, w1, yaw0, l0, w0)
-    both = min(both, area0, area1)
-    return float(both / (area0 + area1 - both))
+        overlap = _intersection_area(-dx, -dy, yaw1, l1, w1, yaw0, l0, w0)
+    overlap = min(overlap, area0, area1)
+    return float(overlap / (area0 + area1 - overlap))
 
 
 @callee
@@ -289,30 +289,30 @@ def _intersection_area(
     for axis, side, reach in ((0, 1.0, by_length), (0, -1.0, by_length), (1, 1.0, by_width), (1, -1.0, by_width)):
         count = _clip_polygon(now, count, axis, side, reach / 2, cut)
         now, cut = cut, now
-    twice = 0.0
+    double_area = 0.0
     for k in range(2, count):  # triangles at the first corner
         ax, ay = now[k - 1, 0] - now[0, 0], now[k - 1, 1] - now[0, 1]
         bx, by = now[k, 0] - now[0, 0], now[k, 1] - now[0, 1]
-        twice += ax * by - ay * bx
-    return float(max(twice / 2, 0.0))
+        double_area += ax * by - ay * bx
+    return float(max(double_area / 2, 0.0))
 
 
 @callee
 def _clip_polygon(polygon: Float, count: int, axis: int, side: float, reach: float, out: Float) -> int:
     """What of a polygon lies where side · coordinate ≤ reach; how many corners that has."""
-    kept = 0
+    corners = 0
     for k in range(count):
         m = k + 1 if k + 1 < count else 0
-        here, there = reach - side * polygon[k, axis], reach - side * polygon[m, axis]
-        if here >= 0.0:
-            out[kept] = polygon[k]
-            kept += 1
-        if (here >= 0.0) != (there >= 0.0):
-            f = here / (here - there)
-            out[kept, axis] = side * reach
-            out[kept, 1 - axis] = polygon[k, 1 - axis] + f * (polygon[m, 1 - axis] - polygon[k, 1 - axis])
-            kept += 1
-    return kept
+        depth, next_depth = reach - side * polygon[k, axis], reach - side * polygon[m, axis]
+        if depth >= 0.0:
+            out[corners] = polygon[k]
+            corners += 1
+        if (depth >= 0.0) != (next_depth >= 0.0):
+            f = depth / (depth - next_depth)
+            out[corners, axis] = side * reach
+            out[corners, 1 - axis] = polygon[k, 1 - axis] + f * (polygon[m, 1 - axis] - polygon[k, 1 - axis])
+            corners += 1
+    return corners
 
 
 # Areas on the ground, their edges included.

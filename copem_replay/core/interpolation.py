@@ -26,11 +26,11 @@ AROUND_S = 1e-3
 
 
 def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_gap_s: float) -> Tracks:
-    """The world at other instants: one list per instant of `stamps_ns (F,)` (ascending), of all objects then there."""
-    own = _find_own_frames(truth, stamps_ns, max_gap_s)
+    """The world at instants `stamps_ns (F,)`, ascending: one list per instant, of all objects present."""
+    own_frames = _find_own_frames(truth, stamps_ns, max_gap_s)
     captured_s: Float = (stamps_ns - t0_ns) * np.float64(1e-9)
-    if own is not None:
-        return truth if len(own) == len(truth.stamp_ns) else _take_frames(truth, own, captured_s)
+    if own_frames is not None:
+        return truth if len(own_frames) == len(truth.stamp_ns) else _take_frames(truth, own_frames, captured_s)
     truth = _cut_around(truth, captured_s, max_gap_s)
     first, last = _track_ends(truth)
     lo = np.searchsorted(stamps_ns, first - SAME_INSTANT_NS, side="left")
@@ -42,12 +42,12 @@ def interpolate_at_instants(truth: Tracks, stamps_ns: Int, *, t0_ns: int, max_ga
     columns: dict[str, Any] = {name: column[None, present] for name, column in states.items()}
     track, frame = track[present], frame[present]
     lengths = np.bincount(track, minlength=len(counts))
-    kept = lengths > 0
+    has_rows = lengths > 0
     return replace(
         truth,
-        start=np.concatenate([[0], np.cumsum(lengths[kept])]),
-        unit_ix=truth.unit_ix[kept],
-        object_ix=truth.object_ix[kept],
+        start=np.concatenate([[0], np.cumsum(lengths[has_rows])]),
+        unit_ix=truth.unit_ix[has_rows],
+        object_ix=truth.object_ix[has_rows],
         frame_ix=frame,
         stamp_ns=np.asarray(stamps_ns, dtype=np.int64),
         captured_s=captured_s,
@@ -163,7 +163,7 @@ def _cut_around(truth: Tracks, captured_s: Float, max_gap_s: float) -> Tracks:
 def interpolate_states(
     truth: Tracks, object_ix: Int, time_s: Float, *, t0_ns: int, max_gap_s: float
 ) -> tuple[dict[str, Float], Bool]:
-    """States of objects `(K,)` at times `(K,)`: a column `(K,)` per value, and whether the object is there then."""
+    """States of objects (K,) at times (K,): one column (K,) per value, and whether the object is present."""
     # One place more than there are objects: index −1, no truth id, has no track.
     track_of = np.full(int(max(object_ix.max(initial=-1), truth.object_ix.max(initial=-1))) + 2, -1)
     track_of[truth.object_ix] = np.arange(len(truth.object_ix))

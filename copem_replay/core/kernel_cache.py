@@ -51,7 +51,7 @@ _naming = Lock()
 
 @contextmanager
 def keep_code() -> Iterator[None]:
-    """While the block lasts, functions that are decorated have their code where `KernelLocator` says."""
+    """While the block lasts, decorated functions have their code where `KernelLocator` says."""
     from numba.core import config
 
     _release_after_writing()
@@ -65,7 +65,7 @@ def keep_code() -> Iterator[None]:
 
 
 class KernelLocator:
-    """Where a kernel's code is: a locator as Numba asks for one."""
+    """The locator that Numba asks for the place of a kernel's code."""
 
     def __init__(self, function: Any, file: str) -> None:
         from numba.core import config
@@ -88,19 +88,19 @@ class KernelLocator:
             return None
 
     def get_cache_path(self) -> str:
-        """The folder."""
+        """The folder of the code."""
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """What changes with the sources."""
+        """A stamp that changes with the sources."""
         return self._digest
 
     def get_disambiguator(self) -> str:
-        """The part of names of files that tells functions and sources apart."""
+        """The part of file names that tells functions and sources apart."""
         return f"{self._line}-{self._digest}"
 
     def ensure_cache_path(self) -> None:
-        """Numba is about to write code: wait until no other process does, and remove code of other sources."""
+        """Before Numba writes code: wait until no other process does, and remove the code of other sources."""
         self._folder.mkdir(parents=True, exist_ok=True)
         _writing.begin(self)
         python = self._files.rpartition(".")[2]

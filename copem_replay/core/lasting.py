@@ -48,7 +48,7 @@ class ListStamps:
     frame_ix: Int
 
     def take(self, rows: Int) -> ListStamps:
-        """All lists, and of the rows only `rows (K,)`."""
+        """All lists, with only the rows `rows (K,)`."""
         return replace(self, frame_ix=self.frame_ix[rows])
 
 
@@ -67,18 +67,18 @@ class Births:
     gone_ns: Int
 
 
-def drop_unshared(random_key: RandomKey, of: Of) -> RandomKey:
-    """The address (P,) of a number that more than one unit and object have in common: without what may differ."""
-    if of in ("object", "all"):
+def drop_unshared(random_key: RandomKey, shared_by: Of) -> RandomKey:
+    """The address (P,) of a number that units or objects share: without the parts in which they differ."""
+    if shared_by in ("object", "all"):
         random_key = replace(random_key, units=("",), unit_ix=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
-    if of in ("unit", "all"):
+    if shared_by in ("unit", "all"):
         of_all = np.full(len(random_key.stamp_ns), stable_hash("everyone"), dtype=np.uint64)
         random_key = replace(random_key, object_word=of_all)
     return random_key
 
 
 def drop_capture(random_key: RandomKey) -> RandomKey:
-    """The address (P,) of a number that lasts for a whole run: without the capture."""
+    """The address (P,) of a number that lasts a whole run: without the capture."""
     return replace(random_key, stamp_ns=np.zeros(len(random_key.stamp_ns), dtype=np.int64))
 
 
@@ -95,7 +95,7 @@ def draw_held_uniforms(
 def renewal_stamps(
     rng: CounterRng, purpose: str, random_key: RandomKey, runs: Int, correlation_s: float, *, where: Bool | None = None
 ) -> Int:
-    """(S, P) a stamp that tells the renewal in force from all others of its series, by which more can be drawn."""
+    """(S, P) a stamp of the renewal in force, unique in its series: an address under which more numbers are drawn."""
     return _draw_held(rng, purpose, random_key, runs, correlation_s, where, renewals_too=True)[1]
 
 
@@ -462,7 +462,7 @@ def fill_correlated_rows(
     """
     top, leaf = levels
     shared, fresh = weights
-    frame, first, list_ns, from_before, from_right, own = lists
+    frame, first, list_ns, from_before, from_right, from_noise = lists
     chained = len(frame) > 0
     everywhere = where.shape[0] == 1 and where.shape[1] == 1
     # Values at the ends of the interval of each level, 2^(leaf + i) long, around the row before.
@@ -514,8 +514,8 @@ def fill_correlated_rows(
                 last_list, value = first[f] - 1, left[0]
             for g in range(last_list + 1, f + 1):
                 value = from_before[g] * value + from_right[g] * right[0]
-                if own[g] > 0:
-                    value += own[g] * _draw_standard_normal(k, w, list_ns[g], run)
+                if from_noise[g] > 0:
+                    value += from_noise[g] * _draw_standard_normal(k, w, list_ns[g], run)
             last_list = f
             out[s, p] = value
 
@@ -532,7 +532,7 @@ def list_births(
     alive_ns: tuple[int, int],
     births: tuple[Int, Int, Int, Int, Int],
 ) -> int:
-    """How many births of rows (R,) in runs (S,) live at some instant of `alive_ns` (from, and before).
+    """Count the births of rows (R,) in runs (S,) that live at some instant of `alive_ns` (from, and before).
 
     Cells from and before. `births` (B,) each: run, row, address, begin and end of each, filled as far as there is room.
     """

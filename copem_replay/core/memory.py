@@ -69,7 +69,7 @@ Memory = dict[Id, Parts]
 
 
 def number_parts(parts: tuple[MemoryPart, ...]) -> Iterator[tuple[int, MemoryPart]]:
-    """Each part, with its number among the parts that have its `of`."""
+    """Each part, with its number among the parts of the same `of`."""
     of = [part.of for part in parts]
     for k, part in enumerate(parts):
         yield of[:k].count(part.of), part

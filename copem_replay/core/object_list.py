@@ -115,7 +115,7 @@ class ObjectLists:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All lists of all units, when the receiver has each, and the instants at which it issues a fused list.
+    """All lists of all units, the instants at which the receiver has each, and those at which it issues fused lists.
 
     List f is the same capture of the same unit in all runs; what is in it differs from run to run. Entries of one list
     are in a random order that is the same however the recording was ordered. Times are seconds since the log's start.
@@ -152,7 +152,7 @@ _OTHER = CLASSES.index("other")
 
 @borrowing
 def most_probable_class(probability: Float) -> int:
-    """Index of the largest of the probabilities `(C,)`, the first of equals; `other` where nothing is said."""
+    """Index of the largest of the probabilities `(C,)`, the first of equals; `other` where all are 0."""
     best = 0
     for c in range(1, len(probability)):
         if probability[c] > probability[best]:

@@ -35,7 +35,7 @@ def stable_hash(*parts: str | int) -> int:
 
 
 def object_words(object_ids: Sequence[str]) -> Words:
-    """(N,) the word by which each object is addressed."""
+    """(N,) the 64-bit word in the addresses of each object's random numbers."""
     return np.array([stable_hash("object", name) for name in object_ids], dtype=np.uint64)
 
 
@@ -52,7 +52,7 @@ class RandomKey:
     stamp_ns: Int
 
     def take(self, rows: Int) -> RandomKey:
-        """The addresses of the rows `rows (K,)` alone: their numbers do not change."""
+        """The addresses of the rows `rows (K,)`: their numbers do not change."""
         return RandomKey(self.units, self.unit_ix[rows], self.object_word[rows], self.stamp_ns[rows])
 
 

@@ -33,7 +33,7 @@ class Lane:
         return np.concatenate([self.left_m[:, :2], self.right_m[::-1, :2]])
 
     def across(self) -> tuple[Float, Float]:
-        """Points (N, 3) of the left and the right border at the same shares of their lengths: where either has one."""
+        """Points (N, 3) of the left and the right border at equal shares of their lengths, at the vertices of both."""
         lines = (self.left_m, self.right_m)
         lengths = [np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))) for line in lines]
         shares = np.unique(np.concatenate([at / at[-1] for at in lengths if at[-1] > 0.0] or [[0.0, 1.0]]))
@@ -44,12 +44,12 @@ class Lane:
         return left, right
 
     def turned(self) -> Lane:
-        """The lane driven the other way."""
+        """The lane in the opposite driving direction."""
         return replace(self, left_m=self.right_m[::-1], right_m=self.left_m[::-1])
 
 
 def make_area(name: str, kind: AreaKind | LaneKind, *rings_m: Float) -> Area:
-    """An area of rings (K, 2), the outer first; the first corner may be there again at the end."""
+    """An area of rings (K, 2), the outer first; a ring may repeat its first corner at the end."""
     rings = [ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring for ring in rings_m]
     return Area(name, kind, tuple(tuple((float(x), float(y)) for x, y in ring[:, :2]) for ring in rings))
 
@@ -68,7 +68,7 @@ class MapSolid(NamedTuple):
 
 @dataclass(frozen=True)
 class SiteMap:
-    """A map as its file has it. `proj`: the projection that the file names for its metres, "": none."""
+    """A map as its file states it. `proj`: the projection of its metres that the file names, "": none."""
 
     lanes: tuple[Lane, ...] = ()
     areas: tuple[Area, ...] = ()
@@ -100,7 +100,7 @@ def _move_area(area: Area, move: Callable[[Float], Float]) -> Area:
 
 
 def find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
-    """The borders of lanes, once where two lanes share one."""
+    """The borders of lanes; a border that two lanes share is there once."""
     seen = set[bytes]()
     for line in (line for lane in lanes for line in (lane.left_m, lane.right_m)):
         names = {line.tobytes(), line[::-1].tobytes()}
@@ -110,7 +110,7 @@ def find_borders(lanes: Sequence[Lane]) -> Iterator[Float]:
 
 
 def outline_crosswalks(areas: Sequence[Area], lanes: Sequence[Lane]) -> Iterator[Float]:
-    """Outlines (K, 3) of crosswalks, the first corner again, as high as the nearest points of lanes' borders."""
+    """Closed outlines (K, 3) of crosswalks, as high as the nearest points of lanes' borders."""
     from scipy.spatial import KDTree
 
     points = np.concatenate([np.zeros((1, 3)) if not lanes else np.empty((0, 3)), *find_borders(lanes)])
@@ -126,7 +126,7 @@ _MOST_CROSSING = 200
 
 
 def make_polygon(rings_m: Sequence[Any]) -> Any:
-    """The polygon of rings as shapely has it, mended where its edges cross; empty where they cross and are many."""
+    """The shapely polygon of rings, mended where edges cross; empty where they cross and are many."""
     import shapely
 
     polygon = shapely.Polygon(rings_m[0], rings_m[1:]) if len(rings_m[0]) > 2 else shapely.Polygon()

@@ -104,7 +104,7 @@ class Solid(NamedTuple):
 
     @property
     def top_m(self) -> float:
-        """Above z = 0."""
+        """The height of the upper end above z = 0."""
         return self.bottom_m + self.height_m
 
     @property
@@ -345,7 +345,7 @@ class Tracks:
         return np.flatnonzero(missed) + 1
 
     def take_tracks(self, keep: Bool) -> Tracks:
-        """Only the tracks of `keep` (E,). Lists stay: one that held only others is then an empty list."""
+        """Only the tracks in the mask `keep` (E,). Lists stay: one that loses all entries is an empty list."""
         return self if keep.all() else self.take_rows(np.flatnonzero(np.repeat(keep, np.diff(self.start))))
 
     def take_rows(self, rows: Int, *, states: bool = True) -> Tracks:
@@ -354,7 +354,7 @@ class Tracks:
         `states=False`: states are not needed and become 0, which takes no memory.
         """
         lengths = np.diff(np.searchsorted(rows, self.start))
-        held = lengths > 0
+        has_rows = lengths > 0
         columns: dict[str, Any] = {
             name: None if (a := getattr(self, name)) is None else a[:, rows]
             for name in ("valid", *(STATES if states else ()))
@@ -362,15 +362,15 @@ class Tracks:
         columns |= {} if states else _stateless(len(rows))
         return replace(
             self,
-            start=np.concatenate([[0], np.cumsum(lengths[held])]),
-            unit_ix=self.unit_ix[held],
-            object_ix=self.object_ix[held],
+            start=np.concatenate([[0], np.cumsum(lengths[has_rows])]),
+            unit_ix=self.unit_ix[has_rows],
+            object_ix=self.object_ix[has_rows],
             frame_ix=self.frame_ix[rows],
             **columns,
         )
 
     def in_lists_of(self, other: Tracks) -> Tracks:
-        """These rows in the lists of `other`, which are the same: they take memory once."""
+        """These rows in the lists of `other`, which are equal: so both share the memory."""
         return replace(
             self,
             stamp_ns=other.stamp_ns,
@@ -398,13 +398,13 @@ def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
     Values of a piece that all runs share are repeated where another's differ; a variance, or an age, that only some
     have is 0 for the others.
     """
-    none = np.empty(0, dtype=np.int64)
+    empty = np.empty(0, dtype=np.int64)
     row_offset = np.concatenate([[0], np.cumsum([len(p.frame_ix) for p in pieces])]).astype(np.int64)
     frame_offset = np.concatenate([[0], np.cumsum([len(p.stamp_ns) for p in pieces])]).astype(np.int64)
     unit_offset = np.concatenate([[0], np.cumsum([len(p.units) for p in pieces])]).astype(np.int64)
 
     def shifted(name: str, offset: Int) -> Int:
-        return np.concatenate([none, *(getattr(p, name) + offset[k] for k, p in enumerate(pieces))])
+        return np.concatenate([empty, *(getattr(p, name) + offset[k] for k, p in enumerate(pieces))])
 
     def rows(name: str) -> Any:
         columns = [getattr(p, name) for p in pieces]
@@ -423,9 +423,9 @@ def join_tracks(units: tuple[str, ...], pieces: Sequence[Tracks]) -> Tracks:
         units=units,
         start=np.concatenate([[0], *(p.start[1:] + row_offset[k] for k, p in enumerate(pieces))]),
         unit_ix=shifted("unit_ix", unit_offset),
-        object_ix=np.concatenate([none, *(p.object_ix for p in pieces)]),
+        object_ix=np.concatenate([empty, *(p.object_ix for p in pieces)]),
         frame_ix=shifted("frame_ix", frame_offset),
-        stamp_ns=np.concatenate([none, *(p.stamp_ns for p in pieces)]),
+        stamp_ns=np.concatenate([empty, *(p.stamp_ns for p in pieces)]),
         captured_s=np.concatenate([np.empty(0), *(p.captured_s for p in pieces)]),
         frame_unit_ix=shifted("frame_unit_ix", unit_offset),
         arrives_s=np.concatenate([np.empty((1, 0)), *(p.arrives_s for p in pieces)], axis=1),
@@ -475,7 +475,7 @@ STATES = (*VALUES, *_OPTIONAL)
 
 
 def append_tracks(tracks: Tracks, others: Tracks) -> Tracks:
-    """The tracks and then the others, both of one run and in the lists that both have.
+    """The tracks followed by `others`, both of one run and with the same lists.
 
     Variances that only one of them states are 0 in the other.
     """

@@ -38,7 +38,7 @@ class ViewGeometry:
 
     @classmethod
     def joined(cls, views: Sequence[ViewGeometry]) -> ViewGeometry:
-        """Those of several rows one after the other."""
+        """The view geometries of several sets of rows, one after the other."""
         return cls(**{f.name: np.concatenate([getattr(view, f.name) for view in views]) for f in fields(cls)})
 
     def take(self, rows: Int) -> ViewGeometry:

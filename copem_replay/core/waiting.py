@@ -23,12 +23,12 @@ _tell: list[Callable[[str], None]] = []
 
 
 def tell_waits(tell: Callable[[str], None]) -> None:
-    """From now on call `tell` with a line when a server lets this process wait; nothing else tells of it."""
+    """From now on call `tell` with a line whenever a server lets this process wait."""
     _tell[:] = [tell]
 
 
 def await_server(where: str, ask: Callable[[Callable[..., None]], Answer], *, works: bool = False) -> Answer:
-    """What `ask` returns or raises. It is handed a function to call whenever a byte has come.
+    """The result of `ask`, or its exception. `ask` gets a function to call whenever a byte has come.
 
     `where`: the server, in words. `works`: it may be silent for as long as `WORK_LIMIT_S`. Raises TimeoutError when it
     has been silent for too long; the thread is left behind then, and ends with the process.
@@ -49,11 +49,11 @@ def await_server(where: str, ask: Callable[[Callable[..., None]], Answer], *, wo
         ended.set()
 
     threading.Thread(target=run, daemon=True, name="copem-replay-server").start()
-    told = False
-    while not ended.wait(max(heard_s[0] + (limit_s if told else min(limit_s, TOLD_AFTER_S)) - time.monotonic(), 0.0)):
+    noted = False
+    while not ended.wait(max(heard_s[0] + (limit_s if noted else min(limit_s, TOLD_AFTER_S)) - time.monotonic(), 0.0)):
         silent_s = time.monotonic() - heard_s[0]
-        if silent_s >= TOLD_AFTER_S and not told:
-            told = True
+        if silent_s >= TOLD_AFTER_S and not noted:
+            noted = True
             for tell in _tell:
                 tell(f"{where}: waiting, no byte for {TOLD_AFTER_S:g} s; given up after {limit_s:g} s")
         if silent_s >= limit_s:

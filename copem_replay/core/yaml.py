@@ -24,7 +24,7 @@ Key = tuple[str | int, ...]
 
 
 class NotYamlError(Exception):
-    """A text is not YAML: at which line, and why."""
+    """A text is not YAML: the line and the reason."""
 
     def __init__(self, line: int, why: str) -> None:
         super().__init__(f"line {line}: {why}")
@@ -32,7 +32,7 @@ class NotYamlError(Exception):
 
 
 class AliasesError(NotYamlError):
-    """A text is YAML, and its aliases stand for more than any use has."""
+    """A text is YAML whose aliases expand to more than any use needs."""
 
 
 def parse_yaml(text: str) -> tuple[Any, dict[Key, int], list[tuple[Key, int, str]]]:

@@ -38,7 +38,7 @@ class ObjectsOf(Frozen):
         return self
 
     def expanded(self) -> frozenset[str] | None:
-        """The classes, those of groups among them; None: objects are named by their ids."""
+        """The classes, with groups expanded; None: objects are named by their ids."""
         if self.classes is None:
             return None
         return frozenset(member for name in self.classes for member in CLASS_GROUPS.get(name, (name,)))
@@ -125,7 +125,7 @@ class Criterion(Frozen):
         return self.population == "these_logs"
 
     def find_against(self, configuration: str, known: Sequence[str]) -> tuple[str, bool]:
-        """The other side of a difference, and whether it is of the results of before."""
+        """The configuration that the difference is to, and whether it is in earlier results."""
         other = self.against or ""
         if other in known:
             return other, False
@@ -162,23 +162,23 @@ def parse_fail_on(conditions: Sequence[str], against: str, names: Sequence[str] 
 
 
 def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int], measure: Measure) -> Iterator[str]:
-    """Notes on criteria that no number of runs decides, or that so few cannot meet.
+    """Notes on criteria that no number of runs can decide, or that so few cannot meet.
 
     `counted`: by log how many episodes count.
     """
-    asked = [name for name, one in criteria.items() if not one.of_runs]
+    names = [name for name, one in criteria.items() if not one.of_runs]
     logs = sum(number > 0 for number in counted)
     over = choose_over(logs, sum(counted), 1)
     if over in TRAFFIC:
-        for name in asked:
+        for name in names:
             once = over == "logs" and (criteria[name].weigh or measure.weigh) == DRIVES
             clusters = logs if over == "logs" else sum(counted)
             known = Known(over, clusters, clusters if once else sum(counted))
             if (line := _note_too_few(name, criteria[name], known, measure.horizon_s)) is not None:
                 yield line
-    elif asked:
+    elif names:
         yield (
-            f"criteria {', '.join(asked)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
+            f"criteria {', '.join(names)}: such traffic is not measured by {explain_no_clusters(logs, sum(counted))}, "
             "whatever the runs; `population: these_logs` asks about these recordings"
         )
 
@@ -198,7 +198,7 @@ def _note_too_few(name: str, criterion: Criterion, known: Known, horizon_s: floa
 
 
 def choose_judged(criterion: Criterion, configurations: Mapping[str, Any]) -> list[str]:
-    """The configurations that a criterion is about, of all `configurations` by name."""
+    """The configurations that a criterion judges, out of `configurations`, all by name."""
     if criterion.configurations is not None:
         return list(dict.fromkeys(criterion.configurations))
     judged = [name for name, one in configurations.items() if one.units != TRUTH]

@@ -40,10 +40,10 @@ EACH, NAMES, ITEMS = "{}", "names of {}", "[]"
 """Steps of a path: the values of a mapping; its names in place of them; the items of a list."""
 
 
-def find_values(data: Any, *path: str, above: Key = ()) -> Problems:
-    """Each value at a path of plain data, with its key; none where the data has another shape."""
+def find_values(data: Any, *path: str, prefix: Key = ()) -> Problems:
+    """Pairs of key and value at a path of plain data; none where the data has another shape."""
     if not path:
-        yield above, data
+        yield prefix, data
         return
     step, inner = path[0], list[tuple[Any, Any]]()
     if isinstance(data, Mapping):
@@ -52,7 +52,7 @@ def find_values(data: Any, *path: str, above: Key = ()) -> Problems:
     elif isinstance(data, list | tuple) and step == ITEMS:
         inner = list(enumerate(data))
     for name, value in inner:
-        yield from find_values(value, *path[1:], above=(*above, name))
+        yield from find_values(value, *path[1:], prefix=(*prefix, name))
 
 
 def find_value(data: Any, *path: str, default: Any = None) -> Any:
@@ -100,22 +100,22 @@ _NAMED: Final[tuple[tuple[tuple[str, ...], str, tuple[str, ...], tuple[str, ...]
 
 def _check_names(data: Mapping[str, Any], names: Names) -> Problems:
     """Undefined names, and units that are named twice."""
-    for path, what, before, after in _NAMED:
-        known = [*before, *names[_SECTIONS[what]], *after]
+    for path, noun, before, after in _NAMED:
+        known = [*before, *names[_SECTIONS[noun]], *after]
         right = {*known, TRUTH} if after == _BY_UNIT else {*known}
         for key, name in find_values(data, *path):
             if _is_name(name) and str(name) not in right:
-                yield key, unknown_name_message(what, name, known)
+                yield key, unknown_name_message(noun, name, known)
     modelled, defined = {*_list_modelled_units(data)}, {*names["units"]}
-    for of in ("units", "inputs"):
-        for key, listed in find_values(data, "configurations", EACH, of):
-            left = {*defined}
+    for section in ("units", "inputs"):
+        for key, listed in find_values(data, "configurations", EACH, section):
+            unseen = {*defined}
             for k, unit in enumerate(_list_texts(listed) or ()):
-                if of == "inputs" and unit in modelled:
+                if section == "inputs" and unit in modelled:
                     yield (*key, k), f"unit {unit!r} has a PEM; the inputs of a stack are `recorded` units"
-                elif unit in defined and unit not in left:
+                elif unit in defined and unit not in unseen:
                     yield (*key, k), f"unit {unit!r} named twice"
-                left.discard(unit)
+                unseen.discard(unit)
 
 
 def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
@@ -126,16 +126,16 @@ def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
         if members == "all" and not modelled:
             which = "modelled units; recorded ones are named" if names["units"] else "units"
             yield (*key, "units"), f"all: the experiment has no {which}"
-        own = modelled if members == "all" else listed or []
+        unit_names = modelled if members == "all" else listed or []
         how, posterior = (*key, "fusion", "combine"), find_value(configuration, "fusion", "combine") == "posterior"
-        if posterior and any(_has_memory(data, one) for one in own):
+        if posterior and any(_has_memory(data, one) for one in unit_names):
             yield how, "posterior draws anew at each instant and has no memory; use samples"
-        for one in (one for one in own if posterior and _list_said(data, one, "recorded", "fuses")):
+        for one in (one for one in unit_names if posterior and _list_said(data, one, "recorded", "fuses")):
             yield how, f"posterior draws errors, and what unit {one!r} lists has errors already; use samples"
         if (kind := _fusion_kind(configuration)) is not None and members == TRUTH:
             yield (*key, "fusion"), f"the truth is not fused; {kind} needs units"
         everyone = [TRUTH] if members == TRUTH else [*names["units"], TRUTH]
-        received = own if members == "all" or listed is not None else everyone
+        received = unit_names if members == "all" or listed is not None else everyone
         yield from _check_link((*key, "link"), configuration.get("link"), received, names)
 
 
@@ -208,7 +208,7 @@ def _check_places(data: Mapping[str, Any], names: Names) -> Problems:
 
 def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
     """What has no exact times, and keys that exclude the messages of units."""
-    hits, of = (find_value(data, "measure", "confirm", what, default=1) for what in ("hits", "of"))
+    hits, window = (find_value(data, "measure", "confirm", what, default=1) for what in ("hits", "of"))
     several, units = isinstance(hits, int) and hits > 1, list(_items(data, "units"))
     why = list[str]()
     for name, configuration in _items(data, "configurations"):
@@ -238,8 +238,8 @@ def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
     if find_value(data, "measure", "exact") is not True:
         return
     yield from ((("measure", "exact"), one) for one in why)
-    if hits != 1 and isinstance(of, int) and of > LONGEST_CHAIN:
-        message = f"for `exact` expected at most {LONGEST_CHAIN} (2 to the power of `of` states), found {of}"
+    if hits != 1 and isinstance(window, int) and window > LONGEST_CHAIN:
+        message = f"for `exact` expected at most {LONGEST_CHAIN} (2 to the power of `of` states), found {window}"
         yield ("measure", "confirm", "of"), message
 
 
@@ -269,7 +269,7 @@ def _check_keys(data: Mapping[str, Any], _: Names) -> Problems:
 def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
     """Quantities that nothing in the experiment has, and values that it cannot have."""
     sweep = _mapping(data, "sweep")
-    for quantity, there, message in (
+    for quantity, exists, message in (
         ("penetration_rate", any(isinstance(unit.get("on"), dict) for _, unit in _items(data, "units")),
          "no unit is `on: {classes, penetration_rate}`"),
         ("rate_hz", names["units"], "the experiment has no units"),
@@ -277,7 +277,7 @@ def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
         ("correlation_s", any("detection" in one for pem in names["pems"] for one in _list_memories(data, pem)),
          "no PEM has `memory: {detection: […]}`"),
     ):  # fmt: skip
-        if sweep.get(quantity) and not there:
+        if sweep.get(quantity) and not exists:
             yield ("sweep", quantity), message
     for kind in ("loss", "burst_s"):
         if sweep.get(kind):
@@ -292,13 +292,13 @@ def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
 
 
 def _check_swept_links(data: Mapping[str, Any], kind: str, configurations: Sequence[str]) -> Problems:
-    """Links of the swept configurations whose loss cannot be varied, or not to a value; that there are none at all."""
-    varies, used = False, set[str]()
+    """Problems of swept links: their loss cannot be varied, or not to a value; or no link has the swept quantity."""
+    varies, link_names = False, set[str]()
     for name, configuration in _items(data, "configurations"):
         link = configuration.get("link")
         if name in configurations:
-            used |= set(map(str, link.values())) if isinstance(link, dict) and "kind" not in link else {str(link)}
-    for name, link in ((name, link) for name, link in _items(data, "links") if name in used):
+            link_names |= set(map(str, link.values())) if isinstance(link, dict) and "kind" not in link else {str(link)}
+    for name, link in ((name, link) for name, link in _items(data, "links") if name in link_names):
         reception = _mapping(link, "reception")
         loss = reception.get("kind") if reception else "constant"
         bursts = loss == "gilbert_elliott"
@@ -312,8 +312,8 @@ def _check_swept_links(data: Mapping[str, Any], kind: str, configurations: Seque
                 between = f"good_loss and bad_loss of {name} ({low:g} … {high:g})"
                 yield key, f"expected between {between}, found {value:g}"
     if not varies:
-        what = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
-        yield ("sweep", kind), what
+        fault = "no link loses lists" if kind == "loss" else "no link has bursts (gilbert_elliott, or memory.reception)"
+        yield ("sweep", kind), fault
 
 
 def _fusion_kind(configuration: Mapping[str, Any]) -> str | None:
@@ -385,7 +385,7 @@ _ASKED: dict[str, tuple[Callable[[Mapping[str, Any]], bool], str]] = {
 
 
 def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterator[str]:
-    """A line for every metric and configuration that criteria name and the experiment `study`, plain data, has not."""
+    """One line for every metric and configuration that criteria name and the experiment `study`, plain data, lacks."""
     known = [str(name) for name in _mapping(study, "configurations")]
     for name, criterion in _items(source.data, "criteria"):
         key: Key = ("criteria", name)
@@ -397,11 +397,11 @@ def check_criteria(source: ExperimentSource, study: Mapping[str, Any]) -> Iterat
         if criterion.get("weigh") is not None and metric not in JUDGED and not of_rows:
             what = f"{metric}, which is over pairs, lists or minutes"
             yield source.at((*key, "weigh"), f"expected `weigh` with a metric of detections, found {what}")
-        for at, one in find_values(criterion, "configurations", ITEMS, above=key):
+        for at, one in find_values(criterion, "configurations", ITEMS, prefix=key):
             if isinstance(one, str | int) and str(one) not in known:
                 yield source.at(at, _unknown_configuration(one, known))
         for by, what, values in ((CLASS, "class", CLASSES), (BEGAN_BY, "way to begin", BEGAN)):
-            for at, one in find_values(criterion, "by", by, above=key):
+            for at, one in find_values(criterion, "by", by, prefix=key):
                 if isinstance(one, str) and one not in values:
                     yield source.at(at, unknown_name_message(what, one, values))
         if isinstance(against, str | int) and str(against) not in known:
@@ -417,25 +417,25 @@ def _unknown_configuration(name: object, known: Sequence[str]) -> str:
 
 def _find_metric_problem(metric: str, paired: bool, study: Mapping[str, Any]) -> str | None:
     """Why a metric cannot be held against a bound; None: it can. `paired`: it is a difference."""
-    own = [str(name) for _, name in find_values(study, "measure", "metrics", ITEMS, "name")]
-    of = {name.name: what for what, names in METRICS_OF.items() for name in names}
-    if metric not in of and metric not in own and metric not in COMPARED:
-        hint = near_name_hint(metric, [*of, *own, *COMPARED]) or "; `copem-replay schema` lists them"
+    own_names = [str(name) for _, name in find_values(study, "measure", "metrics", ITEMS, "name")]
+    part_of = {name.name: part for part, names in METRICS_OF.items() for name in names}
+    if metric not in part_of and metric not in own_names and metric not in COMPARED:
+        hint = near_name_hint(metric, [*part_of, *own_names, *COMPARED]) or "; `copem-replay schema` lists them"
         return f"expected a column of summary.csv, found {metric}{hint}"
     if paired and metric not in COMPARED:
         listed = ", ".join(COMPARED)
         return f"expected a metric that `compare` pairs, as there is `against`, found {metric}; there are {listed}"
-    judged = (*JUDGED, *SUMMED, *PER_MINUTE, *JUDGED_DRIVING, *own)
+    judged = (*JUDGED, *SUMMED, *PER_MINUTE, *JUDGED_DRIVING, *own_names)
     if not paired and metric not in judged:
         if metric in COMPARED:
             return f"{metric} is a difference of two configurations; say `against: <configuration>`"
         return f"expected a metric that has an interval over logs or runs, found {metric}{_judged_instead(metric)}"
-    needs = [of.get(metric, "")] + ["braking"] * (metric in JUDGED and "braking" in JUDGED[metric].rows)
+    needs = [part_of.get(metric, "")] + ["braking"] * (metric in JUDGED and "braking" in JUDGED[metric].rows)
     if "needless" in needs or (metric in COMPARED and (COMPARED[metric].compared or (0, 0, ()))[2]):
         needs.append("accuracy")
-    for what in needs:
-        if what in _ASKED and not _ASKED[what][0](study):
-            return f"expected a metric that the experiment measures, found {metric}; {_ASKED[what][1]} would"
+    for part in needs:
+        if part in _ASKED and not _ASKED[part][0](study):
+            return f"expected a metric that the experiment measures, found {metric}; {_ASKED[part][1]} would"
     return None
 
 

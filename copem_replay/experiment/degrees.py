@@ -18,7 +18,7 @@ _FAR_M: Final = 50_000.0
 
 
 def uses_degrees(experiment: Experiment) -> bool:
-    """Whether places of an experiment, those of maps apart, are degrees."""
+    """Whether any place in an experiment, except in its maps, is in degrees."""
     return any(True for _ in _list_degrees(experiment))
 
 

@@ -138,13 +138,13 @@ def _apply_measure(measure: Measure, changes: Mapping[str, Any]) -> Measure:
 
 def _keep_configurations(experiment: Experiment, units: Mapping[str, Unit]) -> dict[str, Configuration]:
     """The configurations, with the units that the log has, except those that lose all their units."""
-    kept: dict[str, Configuration] = {}
+    remaining: dict[str, Configuration] = {}
     for name, configuration in experiment.configurations.items():
         members = experiment.units_of(configuration)
-        left = tuple(unit for unit in members if unit in units)
+        present = tuple(unit for unit in members if unit in units)
         changed: dict[str, Any] = {}
-        if len(left) < len(members) and configuration.units != "all":
-            changed["units"] = left
+        if len(present) < len(members) and configuration.units != "all":
+            changed["units"] = present
         latency_s = configuration.latency_s
         if isinstance(latency_s, dict) and not latency_s.keys() <= {*units, "default", "truth"}:
             changed["latency_s"] = {
@@ -154,9 +154,9 @@ def _keep_configurations(experiment: Experiment, units: Mapping[str, Unit]) -> d
             changed["link"] = {
                 unit: link for unit, link in configuration.link.items() if unit in units or unit not in experiment.units
             }
-        if left or not members:
-            kept[name] = configuration.model_copy(update=changed) if changed else configuration
-    return kept
+        if present or not members:
+            remaining[name] = configuration.model_copy(update=changed) if changed else configuration
+    return remaining
 
 
 def settings_notes(experiment: Experiment) -> Iterator[str]:
@@ -164,11 +164,11 @@ def settings_notes(experiment: Experiment) -> Iterator[str]:
     logs = [entry for entry in experiment.logs if isinstance(entry, LogSettings)]
     for name, configuration in experiment.configurations.items():
         members = experiment.units_of(configuration)
-        without: dict[tuple[str, ...], list[str]] = {}
+        lacking: dict[tuple[str, ...], list[str]] = {}
         for entry in logs:
             if missing := tuple(unit for unit in members if unit in entry.units and entry.units[unit] is None):
-                without.setdefault(missing, []).append(entry.name or "")
-        for missing, names in without.items():
+                lacking.setdefault(missing, []).append(entry.name or "")
+        for missing, names in lacking.items():
             where = f"{len(names)} of {count_noun(len(experiment.logs), 'log')} ({_shorten_names(names)})"
             if len(missing) == len(members):
                 yield f"configuration {name}: none of its units in {where}, and left out there"

@@ -30,16 +30,16 @@ from copem_replay.io.open import DriveRecordings, File, Place, first_recording, 
 # Problems of shape in the words of the file: the key, what was expected, what was found.
 
 
-def describe_by_key(error: ValidationError, data: dict[str, Any], above: Key = ()) -> Iterator[tuple[Key, str]]:
+def describe_by_key(error: ValidationError, data: dict[str, Any], prefix: Key = ()) -> Iterator[tuple[Key, str]]:
     """A message per key, which joins the alternatives of the key.
 
-    `data`: the validated value, which stands at the key `above`.
+    `data`: the validated value, which stands at the key `prefix`.
     """
     items_by_key: dict[Key, list[Any]] = {}
     for item in error.errors(include_url=False):
         if item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]:
             continue  # long enough, but its items were refused, which have their own lines
-        items_by_key.setdefault((*above, *_file_key(data, item)), []).append(item)
+        items_by_key.setdefault((*prefix, *_file_key(data, item)), []).append(item)
     above_others = {key[:n] for key in items_by_key for n in range(len(key))}
     misspelt = {
         (*key[:-1], *find_meant_key(key, items[0]["ctx"]["known"]))
@@ -97,7 +97,7 @@ def _unit_hint(written: str, meant: str) -> str:
 
 
 def find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
-    """The known key that is alike an unknown one, if any."""
+    """The known key most like an unknown one, if any is."""
     return difflib.get_close_matches(str(key[-1]), known, n=1)
 
 
@@ -243,7 +243,7 @@ def make_plain_source(data: Mapping[str, Any]) -> PlainSource:
 
 
 def format_key(key: Key) -> str:
-    """`units.ego.height_m`, `logs[0]`."""
+    """A key as text: `units.ego.height_m`, `logs[0]`."""
     text = ""
     for part in key:
         name = part or "''"
@@ -434,18 +434,18 @@ def recording_address(file: File) -> str:
 
 
 def relocate_settings(
-    entry: LogSettings, place: Place, called: Callable[[File], str] = recording_address
+    entry: LogSettings, place: Place, address_of: Callable[[File], str] = recording_address
 ) -> LogSettings:
-    """The settings of an entry for the recording or recordings at `place`, named by `called`."""
+    """The settings of an entry for the recording or recordings at `place`, named by `address_of`."""
     if not isinstance(place, DriveRecordings) or len(place.paths) == 1:
-        return entry.model_copy(update={"file": called(first_recording(place))})
-    names = tuple(called(path) for path in place.paths)
+        return entry.model_copy(update={"file": address_of(first_recording(place))})
+    names = tuple(address_of(path) for path in place.paths)
     offsets = {name: ahead_s for name, ahead_s in zip(names, place.ahead_s, strict=True) if ahead_s}
     return entry.model_copy(update={"together": names} | ({"clock_offset_s": offsets} if offsets else {}))
 
 
 def settings_places(entries: Sequence[LogEntry], k: int, folder: Path, listed: Listed | None = None) -> list[Place]:
-    """The places of the recordings that the settings of an entry are for."""
+    """The places of the recordings to which the settings of an entry apply."""
     entry = entries[k]
     if isinstance(entry, str):
         return []
@@ -492,12 +492,12 @@ def replace_logs(source: ExperimentSource, paths: Sequence[str], option: str = "
     return replace(source, data=data, logs=tuple(paths), options=options)
 
 
-def _without_shown(source: ExperimentSource, kept: set[str]) -> dict[str, Any]:
-    """The data without those names in `show: {logs}` that are of logs of the file, and not among `kept`."""
+def _without_shown(source: ExperimentSource, kept_names: set[str]) -> dict[str, Any]:
+    """The data without those names in `show: {logs}` that are of logs of the file, and not among `kept_names`."""
     show, named = source.data.get("show"), source.data.get("logs")
     if not isinstance(show, dict) or not isinstance(show.get("logs"), list) or not isinstance(named, list):
         return source.data
-    gone = _names_of(named, source.path.parent, source.listed) - kept
+    gone = _names_of(named, source.path.parent, source.listed) - kept_names
     logs = [name for name in show["logs"] if str(name).rpartition("/")[2] not in gone]
     return source.data | {"show": show | {"logs": logs or ["first"]}}
 

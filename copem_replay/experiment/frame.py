@@ -92,7 +92,7 @@ class FrameOfLog(Frozen):
 
 
 def write_frame(frame: Frame) -> FrameOfLog:
-    """A frame as an experiment file has it."""
+    """A frame in the form of the experiment file."""
     return FrameOfLog(proj=frame.proj, offset_m=frame.offset_m, yaw_deg=math.degrees(frame.yaw_rad))
 
 
@@ -100,41 +100,41 @@ _APART_M: Final = 1.0
 
 
 def find_frame(
-    written: FrameOfLog | None, maps: Sequence[MapFile], recording: Recording
+    frame_key: FrameOfLog | None, maps: Sequence[MapFile], recording: Recording
 ) -> tuple[Frame | None, str, list[str]]:
     """The frame of a recording; why there is none; notes. The experiment comes first, then the recording, then maps.
 
     Raises InputError where the one that is to be taken cannot be.
     """
     middle_m, notes = find_middle(recording), list[str]()
-    said: dict[str, tuple[Frame, list[str]]] = {}
+    claims: dict[str, tuple[Frame, list[str]]] = {}
     why = "the recording does not say where it is"
-    if written is not None:
-        said["frame"] = written.frame, [f"frame: {note}" for note in written.notes]
+    if frame_key is not None:
+        claims["frame"] = frame_key.frame, [f"frame: {note}" for note in frame_key.notes]
     if recording.place_said is not None:
         try:
-            said["the recording"] = recording.place_said.read()
+            claims["the recording"] = recording.place_said.read()
         except InputError as error:
             why = str(error)
-            notes += [f"place: {why}"] if not said else []
-    for asked in maps:
-        site = asked.read_once()
-        if asked.frame == "same" and site.proj:
+            notes += [f"place: {why}"] if not claims else []
+    for map_file in maps:
+        site = map_file.read_once()
+        if map_file.frame == "same" and site.proj:
             try:
                 frame, of_map = SaidPlace(site.proj, site.offset_m, site.yaw_rad).read()
             except InputError:
                 continue  # as for a log, the projection of a map is taken only where it can be
-            back_m = (-asked.offset_m[0], -asked.offset_m[1])
+            back_m = (-map_file.offset_m[0], -map_file.offset_m[1])
             offset_m = frame.project(back_m)[0]
-            said[asked.file] = Frame(frame.proj, (float(offset_m[0]), float(offset_m[1])), frame.yaw_rad), of_map
-    if not said:
+            claims[map_file.file] = Frame(frame.proj, (float(offset_m[0]), float(offset_m[1])), frame.yaw_rad), of_map
+    if not claims:
         return None, why, notes
-    (first, (frame, of_first)), *others = said.items()
+    (first, (frame, of_first)), *other_claims = claims.items()
     notes += of_first
     notes += check_scale(frame, middle_m)
-    here = frame.to_wgs84(middle_m)[0]
-    for name, (other, _) in others:
-        apart_m = distance_on_earth_m(here, other.to_wgs84(middle_m)[0])
+    middle = frame.to_wgs84(middle_m)[0]
+    for name, (other, _) in other_claims:
+        apart_m = distance_on_earth_m(middle, other.to_wgs84(middle_m)[0])
         if not apart_m <= _APART_M:
             notes.append(
                 f"place: {name} puts the middle of the log {apart_m:,.0f} m from where {first} does, which is taken"

@@ -99,7 +99,7 @@ class MapFile(Frozen):
         return self._sha256
 
     def read_once(self) -> SiteMap:
-        """The map as its file has it. Raises InputError."""
+        """The map in its file's frame. Raises InputError."""
         return _read_map_once(self.file, self._sha256, tuple(self.heights_m.model_dump().items()))
 
     def place(self, frame: Frame | None) -> SiteMap:
@@ -110,11 +110,11 @@ class MapFile(Frozen):
         if not site.degrees and not site.proj:
             raise InputError(f"{self.file}: its places are metres: expected `frame: same` where they are the log's")
         if frame is None:
-            what = "degrees" if site.degrees else f"metres of {site.proj!r}"
+            units = "degrees" if site.degrees else f"metres of {site.proj!r}"
             expected = "expected `frame: {proj: …}` of the log" + " or, where they are the log's, `frame: same`" * (
                 not site.degrees
             )
-            raise InputError(f"{self.file}: its places are {what}, and the log does not say where it is: {expected}")
+            raise InputError(f"{self.file}: its places are {units}, and the log does not say where it is: {expected}")
         try:
             if site.degrees:
                 return site.moved(lambda degrees: frame.from_wgs84(degrees[:, ::-1]) + offset_m)
@@ -125,7 +125,7 @@ class MapFile(Frozen):
         return replace(moved, assumed=(*moved.assumed, *notes))
 
     def choose_kinds(self, site: SiteMap) -> list[MapSolid]:
-        """The solids of a map that are asked for."""
+        """The solids of a map of the requested kinds."""
         if isinstance(self.solids, bool):
             return list(site.solids) if self.solids else []
         wanted = {name for kind in self.solids for name in _KINDS_OF.get(kind, (kind,))}
@@ -141,25 +141,25 @@ def _read_map_once(file: str, _sha256: str, heights_m: tuple[tuple[str, float], 
 def add_maps(
     recording: Recording, maps: Sequence[MapFile], frame: Frame | None = None
 ) -> tuple[Recording, list[tuple[Key, str]]]:
-    """A recording with what its maps add, and the problems with them, by key. `frame`: of the recording."""
+    """A recording with the content of its maps added, and the problems with them by key. `frame`: of the recording."""
     lines, areas, solids = list(recording.lane_boundaries), list(recording.scene.areas), list(recording.scene.solids)
     lanes, notes, problems = list(recording.lanes), list(recording.notes), list[tuple[Key, str]]()
     if lanes:
         notes.append(f"lanes of the recording: {find_agreement(recording.scene, recording.truth, lanes).words}")
-    for k, asked in enumerate(maps):
-        where = f"{FROM_MAP}{k}] {Path(asked.file).name}"
+    for k, source in enumerate(maps):
+        where = f"{FROM_MAP}{k}] {Path(source.file).name}"
         try:
-            site = asked.place(frame)
+            site = source.place(frame)
         except InputError as error:
             problems.append((("maps", k), str(error)))
             continue
         notes += [f"{where}: {site.licence}"] if site.licence else []
         notes += [f"{where}: {line}" for line in site.assumed]
-        if asked.lanes and site.lanes:
+        if source.lanes and site.lanes:
             found = find_agreement(recording.scene, recording.truth, site.lanes)
             notes.append(f"{where}: {found.words}")
-            if found.refused and asked.agreement == "check":
-                problems.append((("maps", k), _explain_refusal(asked, found.share or 0.0)))
+            if found.refused and source.agreement == "check":
+                problems.append((("maps", k), _explain_refusal(source, found.share or 0.0)))
             lines += [*find_borders(site.lanes), *outline_crosswalks(site.areas, site.lanes)]
             lanes += site.lanes
         drawn = [area for area in site.areas if not make_polygon(area.rings_m).is_empty]
@@ -167,7 +167,7 @@ def add_maps(
         if len(drawn) < len(site.areas):
             left_out = count_noun(len(site.areas) - len(drawn), "area")
             notes.append(f"{where}: {left_out} whose outline crosses itself or has no extent: left out")
-        near, said, refused = _choose_solids(recording, asked.choose_kinds(site), asked.within_m, where)
+        near, said, refused = _choose_solids(recording, source.choose_kinds(site), source.within_m, where)
         solids += near
         notes += [f"{where}: {line}" for line in said]
         if site.lanes:
@@ -175,8 +175,8 @@ def add_maps(
         problems += [(("maps", k), refused)] if refused else []
         inside = find_inside(recording.scene, recording.truth, outline_solids(near))
         notes += [f"{where}: {inside.words}"] if inside.words else []
-        if inside.refused and asked.agreement == "check":
-            problems.append((("maps", k), _explain_inside(asked, inside)))
+        if inside.refused and source.agreement == "check":
+            problems.append((("maps", k), _explain_inside(source, inside)))
     corners = sum(len(solid.corners_m) + sum(map(len, solid.holes_m)) + 2 * len(solid.holes_m) for solid in solids)
     # As many triangles at most as corners, and two more for each hole: most maps need not be cut to know.
     if maps and corners > _MOST_PARTS and (parts := len(make_solid_statics(solids).body)) > _MOST_PARTS:
@@ -188,52 +188,52 @@ def add_maps(
     ), problems
 
 
-def _explain_refusal(asked: MapFile, share: float) -> str:
+def _explain_refusal(source: MapFile, share: float) -> str:
     return (
-        f"{Path(asked.file).name}: expected at least {REFUSED_BELOW:.0%} of the states of moving vehicles in a lane of "
-        f"their heading (on real drives {NOTED_BELOW:.0%} and more), found {share:.0%}: is the map in the frame of the "
-        "log? `copem-replay info LOG --map FILE` estimates a shift for `offset_m`; or `agreement: ignore`"
+        f"{Path(source.file).name}: expected at least {REFUSED_BELOW:.0%} of the states of moving vehicles in a lane "
+        f"of their heading (on real drives {NOTED_BELOW:.0%} and more), found {share:.0%}: is the map in the frame of "
+        "the log? `copem-replay info LOG --map FILE` estimates a shift for `offset_m`; or `agreement: ignore`"
     )
 
 
-def _explain_inside(asked: MapFile, inside: Inside) -> str:
+def _explain_inside(source: MapFile, inside: Inside) -> str:
     return (
-        f"{Path(asked.file).name}: expected at most {SOLIDS_REFUSED_ABOVE:.0%} of the states of moving vehicles inside "
-        f"its solids, found {inside.share:.0%}: is the map in the frame of the log? Or `agreement: ignore`"
+        f"{Path(source.file).name}: expected at most {SOLIDS_REFUSED_ABOVE:.0%} of the states of moving vehicles "
+        f"inside its solids, found {inside.share:.0%}: is the map in the frame of the log? Or `agreement: ignore`"
     )
 
 
 def _choose_solids(
     recording: Recording, solids: Sequence[MapSolid], within_m: float, where: str
 ) -> tuple[list[Solid], list[str], str]:
-    """The solids near any object of the log, what is said of the others, and why none is there, if none is."""
+    """The solids near any object of the log; notes on skipped solids; and the reason where no solid is left."""
     import shapely
 
     counts, truth = Counter[str](), recording.truth
     valid = truth.valid[0]
     at_m = np.unique(np.round(truth.x_m[0, valid]) + 1j * np.round(truth.y_m[0, valid]))  # pairs would be sorted slowly
     outlines = make_outlines([solid.rings_m for solid in solids])
-    whole = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
-    distance_m = np.full(len(whole), np.inf)
-    if len(at_m) and len(whole):
+    usable = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
+    distance_m = np.full(len(usable), np.inf)
+    if len(at_m) and len(usable):
         (which, _), nearest_m = shapely.STRtree(shapely.points(at_m.real, at_m.imag)).query_nearest(
-            outlines[whole], return_distance=True, all_matches=False
+            outlines[usable], return_distance=True, all_matches=False
         )
         distance_m[which] = nearest_m
-    chosen = whole[distance_m <= within_m]
-    counts["whose outline crosses itself: left out"] += len(solids) - len(whole)
-    counts[f"beyond {within_m:g} m of every object: left out"] += len(whole) - len(chosen)
+    chosen = usable[distance_m <= within_m]
+    counts["whose outline crosses itself: left out"] += len(solids) - len(usable)
+    counts[f"beyond {within_m:g} m of every object: left out"] += len(usable) - len(chosen)
     near, far_m = _stand_solids(recording, [solids[k] for k in chosen], outlines[chosen], where)
-    said = [f"{count_noun(len(near), 'solid')} of the map may hide"] if near else []
-    said += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items() if number]
+    lines = [f"{count_noun(len(near), 'solid')} of the map may hide"] if near else []
+    lines += [f"{count_noun(number, 'solid')} {what}" for what, number in counts.items() if number]
     if far_m:
         what = f"ground of {count_noun(len(far_m), 'solid')} taken from the nearest object"
-        said.append(f"{what}, up to {max(far_m):.0f} m away")
+        lines.append(f"{what}, up to {max(far_m):.0f} m away")
     least_m = distance_m.min(initial=np.inf)
     if near or not np.isfinite(least_m):
-        return near, said, ""
+        return near, lines, ""
     found = f"0 of {count_noun(len(solids), 'solid')} within {within_m:g} m of the log"
-    return near, said, f"{where.split(' ', 1)[1]}: {found}; nearest {_write_km(least_m)}: is the frame right?"
+    return near, lines, f"{where.split(' ', 1)[1]}: {found}; nearest {_write_km(least_m)}: is the frame right?"
 
 
 def list_far_units(

@@ -85,8 +85,8 @@ def check_against_log(
     studied = not no_ego or experiment.ego != NO_EGO  # a missing ego is reported once
     if not studied and experiment.measure.distance_to == "ego":
         yield ("measure", "distance_to"), "`ego: none` needs `distance_to: <unit>` to measure distances from"
-    within = experiment.measure.objects.within
-    if not studied and within is not None and within.of_ego:
+    condition = experiment.measure.objects.within
+    if not studied and condition is not None and condition.of_ego:
         yield ("measure", "objects", "within"), "no ego in this study, and so no path of it; give `polygon_m`"
     known_areas = (*experiment.areas, *(name for area in scene.areas for name in (area.kind, area.name)))
     for key, areas in _list_named_areas(experiment):
@@ -94,7 +94,7 @@ def check_against_log(
             if name not in known_areas:
                 yield (*key, k), unknown_name_message("area", name, known_areas)
     known_lanes = [*(lane.kind for lane in recording.lanes), *(lane.id for lane in recording.lanes)]
-    for k, name in enumerate((within.lanes if within is not None else None) or ()):
+    for k, name in enumerate((condition.lanes if condition is not None else None) or ()):
         if name not in known_lanes:
             yield ("measure", "objects", "within", "lanes", k), unknown_name_message("lane", name, known_lanes)
     for name, unit in experiment.units.items():
@@ -144,14 +144,14 @@ def _check_units_in_solids(experiment: Experiment, recording: Recording) -> Iter
 
 def _check_velocities(experiment: Experiment, recording: Recording) -> Iterator[tuple[Key, str]]:
     """Lists without velocities cannot say whether the driver must brake, unless their fusion remembers places."""
-    used = {
+    needing = {
         unit
         for name, configuration in experiment.configurations.items()
         if not getattr(configuration.fusion, "remembers", False)
         for unit in (*experiment.units_of(configuration), output_unit(name))
     }
     silent = [name for name, of in recording.lists.items() if not of.velocity_said and len(of.tracks.frame_ix)]
-    if experiment.needless is not None and (named := [name for name in silent if name in used]):
+    if experiment.needless is not None and (named := [name for name in silent if name in needing]):
         yield (
             ("braking", "needless"),
             f"the lists of {', '.join(named)} state no velocity, so all would stand in the way; expected a fusion that "
@@ -185,7 +185,7 @@ class RefusedLog:
         return replace(self, key=("logs", entry or 0, *key)) if is_set else self
 
     def said(self, source: ExperimentSource | None) -> str:
-        """The reason as a line, with the place in the experiment file."""
+        """The reason in one line, with the place in the experiment file."""
         line = f"{self.path}: {self.reason}"
         return line if self.key is None or source is None else source.at(self.key, line)
 
@@ -220,31 +220,31 @@ def resolve_place(path: Path) -> Path:
 
 def log_names(paths: Sequence[File]) -> list[str]:
     """A name per log: the name of its file or folder, made unique by its folder where two are alike."""
-    whole = [(path.path if isinstance(path, RemoteFile) else resolve_place(path)).relative_to("/") for path in paths]
-    bare = [
+    full = [(path.path if isinstance(path, RemoteFile) else resolve_place(path)).relative_to("/") for path in paths]
+    stems = [
         path.parent / (path.stem if isinstance(of, RemoteFile) else name_log(Path("/", path)))
-        for of, path in zip(paths, whole, strict=True)
+        for of, path in zip(paths, full, strict=True)
     ]
-    count = Counter(bare)
-    bare = [short if count[short] == 1 else path for short, path in zip(bare, whole, strict=True)]
+    count = Counter(stems)
+    stems = [short if count[short] == 1 else path for short, path in zip(stems, full, strict=True)]
     depth = [1] * len(paths)
     while True:
-        names = ["/".join(path.parts[-d:]) for path, d in zip(bare, depth, strict=True)]
+        names = ["/".join(path.parts[-d:]) for path, d in zip(stems, depth, strict=True)]
         alike = Counter(names)
-        again = [alike[name] > 1 and d < len(p.parts) for name, p, d in zip(names, bare, depth, strict=True)]
-        if not any(again):
+        clashes = [alike[name] > 1 and d < len(p.parts) for name, p, d in zip(names, stems, depth, strict=True)]
+        if not any(clashes):
             return names
-        depth = [d + twice for d, twice in zip(depth, again, strict=True)]
+        depth = [d + clash for d, clash in zip(depth, clashes, strict=True)]
 
 
 class LogCache(Protocol):
     """A store of logs as they are read, each with the experiment resolved for it. `read` reads the log once more."""
 
     def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
-        """What is known of the log without reading it; None: it has to be read."""
+        """The cached facts of the log; None: it has to be read."""
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
-        """The part of a recording that stays in memory. Raises RecordingError where its files have changed since."""
+        """What stays in memory of a log that was read. Raises RecordingError where its files have changed since."""
 
 
 def read_logs(
@@ -267,13 +267,13 @@ def read_logs(
             refused.append(missing)
         elif (place := place_identity(path)) not in logs:
             entry, settings = settings_of.get(place, (None, None))
-            alone = experiment if settings is None else apply_settings(experiment, settings)
-            read, wrong = partial(_read_again, alone, path), list[RefusedLog]()
-            known = None if survey is None else survey.known(path, alone, read)
+            local = experiment if settings is None else apply_settings(experiment, settings)
+            read, wrong = partial(_read_again, local, path), list[RefusedLog]()
+            known = None if survey is None else survey.known(path, local, read)
             if known is None:
-                known, wrong = recording, wrong = _read_recording(alone, path)
+                known, wrong = recording, wrong = _read_recording(local, path)
                 if recording is not None and not wrong and survey is not None:
-                    known, wrong = _keep_recording(survey, recording, alone, read)
+                    known, wrong = _keep_recording(survey, recording, local, read)
             refused += [log.within(entry, settings) for log in wrong]
             if known is not None and not wrong:
                 named = names_by_place.get(place, [])
@@ -285,11 +285,11 @@ def read_logs(
 
 
 def _keep_recording(
-    survey: LogCache, recording: Recording, experiment: Experiment, again: Callable[[], Recording]
+    survey: LogCache, recording: Recording, experiment: Experiment, reread: Callable[[], Recording]
 ) -> tuple[KnownLog | None, list[RefusedLog]]:
     """The part of a recording that stays in memory, or its refusals where its files have changed since."""
     try:
-        return survey.kept(recording, experiment, again), []
+        return survey.kept(recording, experiment, reread), []
     except RecordingError as error:
         path = first_recording(recording.place)
         return None, [
@@ -370,15 +370,15 @@ def _read_recording(experiment: Experiment, place: Place) -> tuple[Recording | N
     now = RemoteFile(place.url)  # its stamp, asked for just before the copy, identifies the content
     try:
         stamp = now.stamp
-        with fetch_place(place) as here:
-            recording, wrong = _read_local_recording(experiment, here)
+        with fetch_place(place) as local:
+            recording, wrong = _read_local_recording(experiment, local)
             if recording is not None:
-                recording = replace(recording, remote=now, sha256=sha256_of(here), stamps=None)
+                recording = replace(recording, remote=now, sha256=sha256_of(local), stamps=None)
         if RemoteFile(place.url).stamp != stamp:
             return None, [RefusedLog(place, "it changed while it was copied; run the command again")]
     except InputError as error:
         return None, [RefusedLog(place, line.removeprefix(f"{place}: ")) for line in error.problems]
-    return recording, [replace(one, path=place, reason=one.reason.replace(str(here), str(place))) for one in wrong]
+    return recording, [replace(one, path=place, reason=one.reason.replace(str(local), str(place))) for one in wrong]
 
 
 def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recording | None, list[RefusedLog]]:
@@ -393,9 +393,9 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
     wrong: list[RefusedLog] = []
     fields = experiment.read if isinstance(experiment.read, TruthFields) else None
-    beside = {asked.topic for asked in (*experiment.recorded.values(), *experiment.outputs.values())}
+    beside = {recorded.topic for recorded in (*experiment.recorded.values(), *experiment.outputs.values())}
     read = partial(
-        read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, beside=beside,
+        read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, unit_topics=beside,
         window_s=experiment.window_s, max_gap_s=experiment.max_gap_s, classes=experiment.read.classes,
     )  # fmt: skip
     try:
@@ -414,10 +414,10 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     except InputError as error:
         wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
     lists, notes = {}, list(recording.notes)
-    for name, asked in experiment.recorded.items():
+    for name, recorded in experiment.recorded.items():
         try:
             lists[name], list_notes = read_recorded_unit(
-                recording, name, asked, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
+                recording, name, recorded, gate_m=experiment.measure.match.gate_m, max_gap_s=experiment.max_gap_s
             )
             notes += list_notes
         except RecordingError as error:
@@ -438,13 +438,13 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
     recording = replace(recording, scene=scene, lists=lists, notes=(*notes, *of_frame))
-    far = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
+    degree_problems = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
     experiment = resolve_degrees(experiment, frame)
     recording, disagreeing = add_maps(recording, experiment.maps, frame)
     standing = {name: unit.at for name, unit in experiment.units.items() if unit.at is not None}
-    alone = list_far_units(recording, experiment.maps, standing) if standing and experiment.maps else ()
-    recording = take_lanes(experiment, replace(recording, notes=(*recording.notes, *alone)))
-    wrong += [RefusedLog(path, line, key) for key, line in (*far, *disagreeing)]
+    far_notes = list_far_units(recording, experiment.maps, standing) if standing and experiment.maps else ()
+    recording = take_lanes(experiment, replace(recording, notes=(*recording.notes, *far_notes)))
+    wrong += [RefusedLog(path, line, key) for key, line in (*degree_problems, *disagreeing)]
     return recording, wrong + [
         RefusedLog(path, reason, where) for where, reason in check_against_log(experiment, recording, known=bool(wrong))
     ]
@@ -463,17 +463,17 @@ def take_lanes(experiment: Experiment, recording: Recording) -> Recording:
 def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
     """Tags that the summary is sliced by, or that a PEM asks for, and no log has; areas that there are none of."""
     known = {name for scene in scenes for name in scene.tags}
-    asked: list[tuple[Key, str]] = [
+    tags_named: list[tuple[Key, str]] = [
         (("measure", "by", k), name) for k, by in enumerate(parse_slices(experiment.measure.by)) for name in by.tags
     ]
     for pem, of in experiment.pems.items():
-        asked += [
-            (("pems", pem, k, "when", "tags"), n) for k, one in enumerate(of.couples) for n in one.when.tags or ()
+        tags_named += [
+            (("pems", pem, k, "when", "tags"), n) for k, couple in enumerate(of.couples) for n in couple.when.tags or ()
         ]
-    for k, by in enumerate(parse_slices(experiment.measure.by)):
-        if by.names(AREA) and scenes and not (experiment.areas or any(scene.areas for scene in scenes)):
+    for k, entry in enumerate(parse_slices(experiment.measure.by)):
+        if entry.names(AREA) and scenes and not (experiment.areas or any(scene.areas for scene in scenes)):
             yield at(("measure", "by", k), NO_AREAS)
-    for key, name in asked if scenes else ():
+    for key, name in tags_named if scenes else ():
         if name not in known:
             has = f"there are {', '.join(sorted(known))}" if known else "`logs: [{file: …, tags: {…}}]` gives tags"
             yield at(key, f"no log has the tag {name!r}{near_name_hint(name, known)}; {has}")

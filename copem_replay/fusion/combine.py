@@ -39,27 +39,27 @@ def covariance_union(a: Float, A: Float, b: Float, B: Float) -> tuple[Float, Flo
     Whichever of the two is right, P is not too small for it. Where one covers the other, it is returned as it is. The
     order of the two does not matter, beyond rounding.
     """
-    apart = math.hypot(b[0] - a[0], b[1] - a[1])
-    cos, sin = ((b[0] - a[0]) / apart, (b[1] - a[1]) / apart) if apart > 0 else (1.0, 0.0)
+    distance = math.hypot(b[0] - a[0], b[1] - a[1])
+    cos, sin = ((b[0] - a[0]) / distance, (b[1] - a[1]) / distance) if distance > 0 else (1.0, 0.0)
     # B − A along the line from a to b, between along and across, and across
     ee, en, nn = B[0, 0] - A[0, 0], (B[0, 1] + B[1, 0] - A[0, 1] - A[1, 0]) / 2, B[1, 1] - A[1, 1]
     along = cos * cos * ee + 2 * cos * sin * en + sin * sin * nn
-    both = cos * sin * (nn - ee) + (cos * cos - sin * sin) * en
+    cross = cos * sin * (nn - ee) + (cos * cos - sin * sin) * en
     across = sin * sin * ee - 2 * cos * sin * en + cos * cos * nn
-    if _covers(along - apart * apart, both, across):
+    if _covers(along - distance * distance, cross, across):
         return b.copy(), (B + B.T) / 2
-    if _covers(-along - apart * apart, both, -across):
+    if _covers(-along - distance * distance, cross, -across):
         return a.copy(), (A + A.T) / 2
-    u, v = _find_least_trace(along, both, across, apart)
+    u, v = _find_least_trace(along, cross, across, distance)
     mean, P = np.empty(2), (A + A.T) / 2
     mean[0] = (a[0] + b[0]) / 2 + u * cos - v * sin
     mean[1] = (a[1] + b[1]) / 2 + u * sin + v * cos
-    plus = _positive_part(along - 2 * u * apart, both - v * apart, across)
-    from_a = u + apart / 2
-    along, both, across = from_a * from_a + plus[0], from_a * v + plus[1], v * v + plus[2]
-    P[0, 0] += cos * cos * along - 2 * cos * sin * both + sin * sin * across
-    P[1, 1] += sin * sin * along + 2 * cos * sin * both + cos * cos * across
-    P[0, 1] += cos * sin * (along - across) + (cos * cos - sin * sin) * both
+    plus = _positive_part(along - 2 * u * distance, cross - v * distance, across)
+    from_a = u + distance / 2
+    along, cross, across = from_a * from_a + plus[0], from_a * v + plus[1], v * v + plus[2]
+    P[0, 0] += cos * cos * along - 2 * cos * sin * cross + sin * sin * across
+    P[1, 1] += sin * sin * along + 2 * cos * sin * cross + cos * cos * across
+    P[0, 1] += cos * sin * (along - across) + (cos * cos - sin * sin) * cross
     P[1, 0] = P[0, 1]
     return mean, P
 
@@ -71,46 +71,46 @@ def _covers(a: float, b: float, d: float) -> bool:
 
 
 @callee
-def _find_least_trace(along: float, both: float, across: float, apart: float) -> tuple[float, float]:
+def _find_least_trace(along: float, cross: float, across: float, distance: float) -> tuple[float, float]:
     """The place of least trace from the middle: towards b (by golden sections), and to the left of that way."""
-    if apart == 0:
+    if distance == 0:
         return 0.0, 0.0
-    low, high = -apart / 2, apart / 2
+    low, high = -distance / 2, distance / 2
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_left = _minimise_across(left, along, both, across, apart)[1]
-    at_right = _minimise_across(right, along, both, across, apart)[1]
+    at_left = _minimise_across(left, along, cross, across, distance)[1]
+    at_right = _minimise_across(right, along, cross, across, distance)[1]
     for _ in range(_UNION_ROUNDS):
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)
-            at_left = _minimise_across(left, along, both, across, apart)[1]
+            at_left = _minimise_across(left, along, cross, across, distance)[1]
         else:
             low, left, at_left = left, right, at_right
             right = low + _GOLDEN * (high - low)
-            at_right = _minimise_across(right, along, both, across, apart)[1]
+            at_right = _minimise_across(right, along, cross, across, distance)[1]
     u = (low + high) / 2
-    return u, _minimise_across(u, along, both, across, apart)[0]
+    return u, _minimise_across(u, along, cross, across, distance)[0]
 
 
 @callee
-def _minimise_across(u: float, along: float, both: float, across: float, apart: float) -> tuple[float, float]:
+def _minimise_across(u: float, along: float, cross: float, across: float, distance: float) -> tuple[float, float]:
     """The best v for this u, by halvings, and u² + v² + ‖V − U‖₁/2 there.
 
     The norm of (m, q; q, n) is the larger of |m + n| and the root of (m − n)² + 4q².
     """
-    m = along - 2 * u * apart
+    m = along - 2 * u * distance
     trace, difference = abs(m + across), m - across
-    low, high = 0.0, min(abs(both) / apart, apart / 2)
+    low, high = 0.0, min(abs(cross) / distance, distance / 2)
     for _ in range(_UNION_ROUNDS):
         v = (low + high) / 2
-        q = abs(both) - v * apart
+        q = abs(cross) - v * distance
         norm = math.hypot(difference, 2 * q)
-        if norm <= trace or v * norm >= apart * q:
+        if norm <= trace or v * norm >= distance * q:
             high = v
         else:
             low = v
-    v = math.copysign(high, both)
-    norm = max(trace, math.hypot(difference, 2 * (both - v * apart)))
+    v = math.copysign(high, cross)
+    norm = max(trace, math.hypot(difference, 2 * (cross - v * distance)))
     return v, u * u + v * v + norm / 2
 
 
@@ -249,22 +249,22 @@ def combine_by_cross_covariance(x: Float, cov: Float, correlation: float) -> tup
         mean_root += roots[k]
     mean_root /= n
     apart, along = 1 / (1 - correlation), 1 / (1 + (n - 1) * correlation)
-    information, moment, whole = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
+    information, moment, total = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
     for k in range(n):
-        own = roots[k] - mean_root
+        deviation = roots[k] - mean_root
         y = np.zeros(2)
         for i in range(2):
             for j in range(2):
                 y[i] += roots[k, i, j] * (x[k, j] - x[0, j])
-        whole += y
+        total += y
         for i in range(2):
             for j in range(2):
-                moment[i] += apart * own[i, j] * y[j]
+                moment[i] += apart * deviation[i, j] * y[j]
                 for m in range(2):
-                    information[i, j] += apart * own[i, m] * own[m, j]
+                    information[i, j] += apart * deviation[i, m] * deviation[m, j]
     for i in range(2):
         for j in range(2):
-            moment[i] += along * mean_root[i, j] * whole[j]
+            moment[i] += along * mean_root[i, j] * total[j]
             for m in range(2):
                 information[i, j] += n * along * mean_root[i, m] * mean_root[m, j]
     P = np.empty((2, 2))
@@ -410,7 +410,7 @@ INVERSE, SPLIT_BY_SHARE, SPLIT_BY_VARIANCE, CROSS = 0, 1, 2, 3
 
 @kernel
 def combine_members(clusters: EntryClusters, method: int, setting: float, by_determinant: bool, fused: Entries) -> None:
-    """Writes positions and covariances of the clusters, in place; one entry alone stays as it is.
+    """Write the combined positions and covariances of clusters, in place; a single member stays as it is.
 
     `setting`: the dependent share, the dependent variance in m², or the correlation, as the method asks.
     """

@@ -110,16 +110,16 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
 def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -> tuple[Float, Float]:
     """Mean and covariance where input i counts `weight` times."""
     n, d = x.shape
-    only = -1
+    single = -1
     for k in range(n):
         if weight[k] > 0:
-            only = k if only == -1 else -2
+            single = k if single == -1 else -2
     mean, covariance = np.empty(d), np.empty((d, d))
-    if only >= 0 and weight[only] == 1:
+    if single >= 0 and weight[single] == 1:
         for i in range(d):
-            mean[i] = x[only, i]
+            mean[i] = x[single, i]
             for j in range(d):
-                covariance[i, j] = (cov[only, i, j] + cov[only, j, i]) / 2
+                covariance[i, j] = (cov[single, i, j] + cov[single, j, i]) / 2
         return mean, covariance
     total, moment = np.zeros((d, d)), np.zeros(d)
     for k in range(n):
@@ -164,7 +164,7 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
     if n == 1:
         return weight
     info = information.copy()
-    has = np.ones(n, dtype=np.bool_)
+    weighted = np.ones(n, dtype=np.bool_)
     B, lever, score = np.eye(d) / np.sqrt(d), np.empty((n, d, d)), np.empty(n)
     for _ in range(40 + 4 * n):
         _whiten(info, weight, B, by_determinant)
@@ -177,15 +177,15 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
                     for m in range(d):
                         lever[k, i, j] += info[k, i, m] * B[m, j]
                     score[k] += lever[k, i, j] * B[i, j]
-            if has[k]:
+            if weighted[k]:
                 off = max(off, abs(score[k] - 1))
             elif enters < 0 or score[k] > score[enters]:
                 enters = k
         if off <= _GAP:
             if enters < 0 or score[enters] <= 1 + _GAP:
                 break
-            has[enters] = True
-        change = _newton_step(lever, score, has, 1.0 if by_determinant else 2.0)
+            weighted[enters] = True
+        change = _newton_step(lever, score, weighted, 1.0 if by_determinant else 2.0)
         longest = np.inf
         along = np.zeros((d, d))
         for k in range(n):
@@ -200,10 +200,10 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
         step = _search_line(along, B, by_determinant, longest) if off > 1e-6 else min(1.0, longest)
         for k in range(n):
             gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
-            has[k] = has[k] and not gone
-            weight[k] = max(weight[k] + step * change[k], 0.0) if has[k] else 0.0
+            weighted[k] = weighted[k] and not gone
+            weight[k] = max(weight[k] + step * change[k], 0.0) if weighted[k] else 0.0
         weight /= weight.sum()
-    _share_weight(info, weight, has | (score >= 1 - _ALIKE))
+    _share_weight(info, weight, weighted | (score >= 1 - _ALIKE))
     return weight
 
 
@@ -230,28 +230,28 @@ def _share_weight(info: Float, weight: Float, among: Bool) -> None:
                 e += 1
     soft = _SOFT * largest**2
     multiplier, root = np.zeros(size), np.empty((size, size))
-    share, above = np.zeros(c), np.ones(c, dtype=np.bool_)
+    share, is_positive = np.zeros(c), np.ones(c, dtype=np.bool_)
     settled = 0
     for _ in range(50):
-        left, curvature = target.copy(), np.zeros((size, size))
+        residual, curvature = target.copy(), np.zeros((size, size))
         for e in range(size):
-            left[e] -= soft * multiplier[e]
+            residual[e] -= soft * multiplier[e]
             curvature[e, e] += soft
             for p in range(c):
-                left[e] -= share[p] * entries[p, e]
-                if above[p]:
+                residual[e] -= share[p] * entries[p, e]
+                if is_positive[p]:
                     for f in range(e + 1):
                         curvature[e, f] += entries[p, e] * entries[p, f]
         invert_root(curvature, root)
-        multiplier += solve_with_root(root, left)
+        multiplier += solve_with_root(root, residual)
         settled += 1
         for p in range(c):
             total = 0.0
             for e in range(size):
                 total += multiplier[e] * entries[p, e]
-            if above[p] != (total > 0):
+            if is_positive[p] != (total > 0):
                 settled = 0
-            share[p], above[p] = max(total, 0.0), total > 0
+            share[p], is_positive[p] = max(total, 0.0), total > 0
         if settled == 3:  # one step solves it, two more take off what rounding left
             for p in range(c):
                 weight[sharing[p]] = share[p]
@@ -296,9 +296,9 @@ def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
 
 
 @callee
-def _newton_step(lever: Float, score: Float, has: Bool, times: float) -> Float:
+def _newton_step(lever: Float, score: Float, weighted: Bool, times: float) -> Float:
     """Newton's change of the weights (n,), its sum 0; inputs without weight keep none."""
-    active = np.flatnonzero(has)
+    active = np.flatnonzero(weighted)
     c, d = len(active), lever.shape[1]
     curvature, root = np.empty((c, c)), np.empty((c, c))
     for p in range(c):
@@ -312,7 +312,7 @@ def _newton_step(lever: Float, score: Float, has: Bool, times: float) -> Float:
     invert_root(curvature, root)
     gain, ones_solved = solve_with_root(root, score[active] - 1), solve_with_root(root, np.ones(c))
     shift = gain.sum() / ones_solved.sum()  # so that the changes sum to 0
-    change = np.zeros(len(has))
+    change = np.zeros(len(weighted))
     for p in range(c):
         change[active[p]] = gain[p] - shift * ones_solved[p]
     return change
@@ -433,12 +433,12 @@ def _safe_determinant(matrix: Float) -> float:
     d = len(matrix)
     if d == 2:
         return float(matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])
-    left, product = matrix.copy(), 1.0
+    reduced, product = matrix.copy(), 1.0
     for j in range(d):
-        if left[j, j] <= 0:
+        if reduced[j, j] <= 0:
             return 0.0
-        product *= left[j, j]
+        product *= reduced[j, j]
         for i in range(j + 1, d):
             for m in range(j + 1, d):
-                left[i, m] -= left[i, j] * left[j, m] / left[j, j]
+                reduced[i, m] -= reduced[i, j] * reduced[j, m] / reduced[j, j]
     return product

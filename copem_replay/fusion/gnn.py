@@ -78,17 +78,17 @@ class Gnn(ListFusion):
 
     @model_validator(mode="before")
     @classmethod
-    def _said(cls, given: Any) -> Any:
+    def _said(cls, values: Any) -> Any:
         """Defaults of the keys of one way to combine, so that an experiment that is written back has them."""
-        if not isinstance(given, dict):
-            return given
-        own = dict(_KEYS_OF.get(str(given.get("combine")), {}))
-        if "conflict_gate" in own:
-            own["conflict_gate"] = given.get("gate", own["conflict_gate"])
-        if any(given.get(name) is not None for name in own):
-            return given
-        return {name: value for name, value in own.items() if name != "dependent_m2"} | {
-            name: value for name, value in given.items() if name not in own
+        if not isinstance(values, dict):
+            return values
+        defaults = dict(_KEYS_OF.get(str(values.get("combine")), {}))
+        if "conflict_gate" in defaults:
+            defaults["conflict_gate"] = values.get("gate", defaults["conflict_gate"])
+        if any(values.get(name) is not None for name in defaults):
+            return values
+        return {name: value for name, value in defaults.items() if name != "dependent_m2"} | {
+            name: value for name, value in values.items() if name not in defaults
         }
 
     @model_validator(mode="after")

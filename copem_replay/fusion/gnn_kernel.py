@@ -39,7 +39,7 @@ Points = NDArray[Any]
 
 
 class EntryClusters(NamedTuple):
-    """The entries of each cluster of each instant, in one run."""
+    """The clusters of each instant in one run, each with its entries."""
 
     start: Int  # (K + 1,) where the clusters of each instant begin
     begin: Int  # (clusters + 1,) where the members of each begin
@@ -196,7 +196,7 @@ def _list_before(
 
 @callee
 def _find_allowed_pairs(
-    here: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
+    new: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
     """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
 
@@ -206,8 +206,8 @@ def _find_allowed_pairs(
     widest = 0.0
     for c in by_x:
         widest = max(widest, clusters[c].ee)
-    for i in range(len(here)):
-        entry = here[i]
+    for i in range(len(new)):
+        entry = new[i]
         reach = np.sqrt(gate * (widest + entry.ee))
         # The window of a later entry may begin further left where its covariance is larger.
         while low > 0 and clusters[by_x[low - 1]].x_m >= entry.x_m - reach:
@@ -232,7 +232,7 @@ def _find_allowed_pairs(
             volume = np.log(det)
             row[n], col[n], cost[n], spread[n] = i, by_x[p], d2 + volume, volume
             n += 1
-    spread_component_maximum(row[:n], col[:n], spread[:n], len(here), len(by_x))
+    spread_component_maximum(row[:n], col[:n], spread[:n], len(new), len(by_x))
     for p in range(n):
         cost[p] -= gate + spread[p] + _SURPLUS
     return row, col, cost, spread, n
@@ -240,7 +240,7 @@ def _find_allowed_pairs(
 
 @callee
 def join_entry(cluster: Any, entry: Any, informed: bool) -> None:
-    """Takes an entry into a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
+    """Add an entry to a cluster's running state: P⁻¹ = αA⁻¹ + βB⁻¹, x = a + PβB⁻¹(b − a).
 
     α = β = 1, or in proportion to 1/tr A, 1/tr B with sum 1.
     """
@@ -304,7 +304,7 @@ def _lengthen_entries(entries: Entries, used: int, needed: int) -> Entries:
 def write_entry(
     out: Any, state: Any, class_sum: Float, members: Int, points: Points, entries: Entries, arrives_s: Float
 ) -> None:
-    """Writes the fused entry of one cluster, its position that of the running state."""
+    """Write the fused entry of a cluster, with the position of its running state."""
     out.x_m, out.y_m = state.x_m, state.y_m
     out.cov_ee_m2, out.cov_en_m2, out.cov_nn_m2 = state.ee, state.en, state.nn
     total = sin = cos = z = vx = vy = length = width = height = 0.0

@@ -32,19 +32,19 @@ def fuse_ideal(
     max_age_s: float,
     without_object_ix: int = -1,
     instants: FusionSchedule | None = None,
-    kept: KeptEntries | None = None,
+    cached: KeptEntries | None = None,
 ) -> FusedTracks:
     """One fused list per instant of the receiver, as tracks of the one unit `fused`. `instants`: some of the instants.
 
-    `kept`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none.
+    `cached`: the entries that `keep_by_object` keeps of units with partial messages; None: there are none.
 
     `received`: lists with truth ids; arrival times common to all runs. `without_object_ix`: the receiver's own body,
     which it does not list. Frames are the receiver's instants: `arrives_s` is when the list is available,
     `captured_s` the newest capture among the lists that it uses. NaN where an object is in none of them.
     """
     instants = instants or fusion_schedule(received, max_age_s=max_age_s)
-    beside = find_lists_beside_newest(received, instants, kept)
-    rows, start, object_ix, instant = _find_contributions(received, instants, beside, without_object_ix, kept)
+    beside = find_lists_beside_newest(received, instants, cached)
+    rows, start, object_ix, instant = _find_contributions(received, instants, beside, without_object_ix, cached)
     counts, rows, start = (
         _select_newest_entries(received, rows, start) if len(beside.frame) else (received.valid, rows, start)
     )
@@ -105,13 +105,13 @@ def keep_by_object(
     Entries are counted list by list, as in `Tracks.by_frame`.
     """
     order, bounds = received.by_frame
-    kept = received.valid[0] & (received.row_object_ix >= 0)
+    is_listed = received.valid[0] & (received.row_object_ix >= 0)
     object_of = np.unique(np.stack([received.row_unit_ix, received.row_object_ix]), axis=1, return_inverse=True)[
         1
     ].ravel()
     return keep_entries(
         received,
-        SentEntries(bounds, np.where(kept, object_of, -1)[order]),
+        SentEntries(bounds, np.where(is_listed, object_of, -1)[order]),
         partial,
         schedule,
         instants,
@@ -126,20 +126,20 @@ class BesideNewest(NamedTuple):
     frame: Int
 
 
-def find_lists_beside_newest(received: Tracks, instants: FusionSchedule, kept: KeptEntries | None) -> BesideNewest:
-    """The lists beside the newest ones at `instants`, without those of partial messages, which `kept` holds."""
+def find_lists_beside_newest(received: Tracks, instants: FusionSchedule, cached: KeptEntries | None) -> BesideNewest:
+    """The lists beside the newest ones at `instants`, without partial messages: `cached` holds those."""
     instant, frame = instants.beside_newest()
-    if kept is not None:
-        whole = ~kept.partial[received.frame_unit_ix[frame]]
-        instant, frame = instant[whole], frame[whole]
+    if cached is not None:
+        complete = ~cached.partial[received.frame_unit_ix[frame]]
+        instant, frame = instant[complete], frame[complete]
     return BesideNewest(instant, frame)
 
 
 def _select_lists(
-    received: Tracks, instants: FusionSchedule, beside: BesideNewest, kept: KeptEntries | None
+    received: Tracks, instants: FusionSchedule, beside: BesideNewest, cached: KeptEntries | None
 ) -> tuple[Int, Int]:
     """Instants, ascending, and the lists that are used at each: unit by unit, the newest first."""
-    newest = instants.newest if kept is None else kept.newest
+    newest = instants.newest if cached is None else cached.newest
     instant, unit = np.nonzero(newest >= 0)
     frame = newest[newest >= 0]
     if not len(beside.frame):
@@ -151,7 +151,7 @@ def _select_lists(
 
 
 def _find_contributions(
-    received: Tracks, instants: FusionSchedule, beside: BesideNewest, without_object_ix: int, kept: KeptEntries | None
+    received: Tracks, instants: FusionSchedule, beside: BesideNewest, without_object_ix: int, cached: KeptEntries | None
 ) -> tuple[Int, Int, Int, Int]:
     """Contributions: the rows (C,) of `received` that make up each fused row, start (P + 1,), object and instant (P,).
 
@@ -159,10 +159,10 @@ def _find_contributions(
     """
     order, bounds = received.by_frame
     begin, count = bounds[:-1], np.diff(bounds)
-    if kept is not None:
-        begin, count = np.append(begin, kept.start[:-1] + len(order)), np.append(count, np.diff(kept.start))
-        order = np.append(order, order[kept.entry])
-    instant, frame = _select_lists(received, instants, beside, kept)
+    if cached is not None:
+        begin, count = np.append(begin, cached.start[:-1] + len(order)), np.append(count, np.diff(cached.start))
+        order = np.append(order, order[cached.entry])
+    instant, frame = _select_lists(received, instants, beside, cached)
     begin, count = begin[frame], count[frame]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows = order[np.repeat(begin, count) + within]
@@ -215,13 +215,13 @@ def _inverse_covariances(received: Tracks) -> tuple[Float, Float, Float]:
 
 
 def floor_covariances(received: Tracks) -> tuple[Float, Float, Float]:
-    """Position covariances ee, en, nn (1 | S, P) as stated, but no eigenvalue too small: see `floor_eigenvalues`."""
-    stated = _stated_covariances(received)
-    high, low, c2, s2 = _covariance_axes(*stated)
+    """Stated position covariances ee, en, nn (1 | S, P) with small eigenvalues raised: see `floor_eigenvalues`."""
+    cov = _stated_covariances(received)
+    high, low, c2, s2 = _covariance_axes(*cov)
     mean, difference = (high + low) / 2, (high - low) / 2
-    wide = low <= (stated[0] + stated[2]) / 2 - np.hypot((stated[0] - stated[2]) / 2, stated[1])
+    wide = low <= (cov[0] + cov[2]) / 2 - np.hypot((cov[0] - cov[2]) / 2, cov[1])
     ee, en, nn = mean + difference * c2, difference * s2, mean - difference * c2
-    return np.where(wide, stated[0], ee), np.where(wide, stated[1], en), np.where(wide, stated[2], nn)
+    return np.where(wide, cov[0], ee), np.where(wide, cov[1], en), np.where(wide, cov[2], nn)
 
 
 def _stated_covariances(received: Tracks) -> tuple[Float, Float, Float]:
@@ -250,7 +250,7 @@ _WEIGHED_BY = {
 
 
 class WeightedRows(NamedTuple):
-    """Values of rows (P,) and their weights, whichever rows are listed."""
+    """Values and weights of rows (P,), listed or not."""
 
     covariances: tuple[Float, Float, Float]
     information: PositionInformation
@@ -260,14 +260,14 @@ class WeightedRows(NamedTuple):
     @classmethod
     def of(cls, received: Tracks) -> WeightedRows:
         """Values and weights of the rows of `received`."""
-        none = np.zeros((1, len(received.frame_ix)))
+        zeros = np.zeros((1, len(received.frame_ix)))
         information = [
-            1 / np.maximum(none if variance is None else variance, SMALLEST_VARIANCE)
+            1 / np.maximum(zeros if variance is None else variance, SMALLEST_VARIANCE)
             for variance in _stated_variances(received)
         ]
         yaw = {"sin": np.sin(received.yaw_rad), "cos": np.cos(received.yaw_rad)}
         values = [yaw[name] if name in yaw else getattr(received, name) for name in _WEIGHED_BY]
-        scalars, weights = _stack_columns(values), _stack_columns([*information, none + 1])
+        scalars, weights = _stack_columns(values), _stack_columns([*information, zeros + 1])
         return cls(floor_covariances(received), PositionInformation(*_inverse_covariances(received)), scalars, weights)
 
 
@@ -285,8 +285,8 @@ def _combine_scalars(
     shape = len(counts), len(start) - 1
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
     scratch = np.empty(len(rows), np.int64), np.empty((shape[1], len(_WEIGHED_BY)), np.bool_)
-    which = np.array([*_WEIGHED_BY.values()])
-    _sum_scalars(counts, weighed.scalars, weighed.weights, which, rows, start, means, spreads, scratch)
+    weighed_by = np.array([*_WEIGHED_BY.values()])
+    _sum_scalars(counts, weighed.scalars, weighed.weights, weighed_by, rows, start, means, spreads, scratch)
     mean_of = dict(zip(_WEIGHED_BY, means, strict=True))
     out["yaw_rad"] = np.arctan2(mean_of.pop("sin"), mean_of.pop("cos"))
     out.update(mean_of)
@@ -378,12 +378,12 @@ def _sum_scalars(
 
     `values (S | 1, P, V)` and `weights (S | 1, P, W)` have one row where all runs agree.
     """
-    contributing, alike = scratch
+    contributing, equal = scratch
     for p in range(len(start) - 1):  # whether all that may contribute agree, in any run
         for v in range(values.shape[2]):
-            alike[p, v] = values.shape[0] == 1
+            equal[p, v] = values.shape[0] == 1
             for c in range(start[p] + 1, start[p + 1]):
-                alike[p, v] &= values[0, rows[c], v] == values[0, rows[start[p]], v]
+                equal[p, v] &= values[0, rows[c], v] == values[0, rows[start[p]], v]
     for s in range(valid.shape[0]):
         value = values[s if values.shape[0] > 1 else 0]
         weight = weights[s if weights.shape[0] > 1 else 0]
@@ -403,7 +403,7 @@ def _sum_scalars(
             for v in range(means.shape[0]):
                 w, first = weighed_by[v], value[contributing[0], v]
                 moment = 0.0
-                for c in range(1, 1 if alike[p, v] else n):
+                for c in range(1, 1 if equal[p, v] else n):
                     moment += weight[contributing[c], w] * (value[contributing[c], v] - first)
                 if moment != 0.0:
                     total = 0.0

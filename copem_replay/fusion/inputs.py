@@ -19,24 +19,24 @@ from copem_replay.perception.perceive import EntryClaims
 
 
 def make_entry_lists(
-    seen: Tracks, claims: EntryClaims, drawn: Float, *, without_object_ix: int
+    tracks: Tracks, claims: EntryClaims, drawn: Float, *, without_object_ix: int
 ) -> tuple[ObjectLists, Int]:
     """The lists of the runs (S,) with their rows (P,) as entries, in the order of `drawn (S, P)`; their rows (N,)."""
-    columns = {name: getattr(seen, name) for name in VALUES}
-    columns |= zip(COVARIANCES, floor_covariances(seen), strict=True)
-    start, picked = _list_rows(seen, drawn, without_object_ix=without_object_ix)
-    rows = np.zeros(len(seen.frame_ix), dtype=ENTRY)
+    columns = {name: getattr(tracks, name) for name in VALUES}
+    columns |= zip(COVARIANCES, floor_covariances(tracks), strict=True)
+    start, entry_rows = _list_rows(tracks, drawn, without_object_ix=without_object_ix)
+    rows = np.zeros(len(tracks.frame_ix), dtype=ENTRY)
     for name, values in columns.items():  # those that the runs share
         if len(values) == 1:
             rows[name] = values[0]
     rows["existence"], rows["class_probability"], rows["track_id"] = claims
-    rows["captured_s"], rows["unit_ix"] = seen.entry_captured_s, seen.row_unit_ix
-    entries = take_entries(rows, picked)
+    rows["captured_s"], rows["unit_ix"] = tracks.entry_captured_s, tracks.row_unit_ix
+    entries = take_entries(rows, entry_rows)
     run = np.repeat(np.arange(len(start)), start[:, -1] - start[:, 0])
     for name, values in columns.items():
         if len(values) > 1:
-            entries[name] = values[run, picked]
-    return ObjectLists(start, entries), picked
+            entries[name] = values[run, entry_rows]
+    return ObjectLists(start, entries), entry_rows
 
 
 def _list_rows(received: Tracks, drawn: Float, *, without_object_ix: int) -> tuple[Int, Int]:
@@ -57,7 +57,7 @@ def make_inputs(
     instants: FusionSchedule | None = None,
     captured_s: Float | None = None,
 ) -> Inputs:
-    """Lists as the input of a fusion: when the receiver of a configuration has each, and which it uses when.
+    """The input of a fusion: lists with the instants at which the receiver of a configuration has and uses each.
 
     `instants`: some of its instants; None: all. `captured_s (F,)`: the captures that fusion is told; None: the true
     ones.
@@ -70,27 +70,27 @@ def make_inputs(
     )  # fmt: skip
 
 
-def add_kept_entries(inputs: Inputs, kept: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
-    """The input in one run, with the entries that the receiver keeps of units with partial messages, for `max_age_s`.
+def add_kept_entries(inputs: Inputs, cached: KeptEntries, partial: Bool, max_age_s: float) -> Inputs:
+    """The input in one run, plus the entries that the receiver caches of units with partial messages, for `max_age_s`.
 
     `partial (U,)`: those units.
     """
-    lists, frame = inputs.lists, kept.frame
-    start = np.concatenate([lists.start[0], lists.start[0, -1] + kept.start[1:]])[None]
+    lists, frame = inputs.lists, cached.frame
+    start = np.concatenate([lists.start[0], lists.start[0, -1] + cached.start[1:]])[None]
     return replace(
         inputs,
         unit_ix=np.append(inputs.unit_ix, inputs.unit_ix[frame]),
         captured_s=np.append(inputs.captured_s, inputs.captured_s[frame]),
         arrives_s=np.append(inputs.arrives_s, inputs.arrives_s[frame]),
-        lists=ObjectLists(start, join_entries([lists.entries, take_entries(lists.entries, kept.entry)])),
-        newest=kept.newest,
+        lists=ObjectLists(start, join_entries([lists.entries, take_entries(lists.entries, cached.entry)])),
+        newest=cached.newest,
         keeps_s=np.where(partial, max_age_s, 0.0),
     )
 
 
 @kernel
-def _pick_rows(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, picked: Int) -> None:
-    """Fill `start (S, F + 1)` and `picked (N,)` with the valid rows, list by list, ordered by `drawn`."""
+def _pick_rows(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, entry_rows: Int) -> None:
+    """Fill `start (S, F + 1)` and `entry_rows (N,)` with the valid rows, list by list, ordered by `drawn`."""
     n = 0
     for s in range(valid.shape[0]):
         start[s, 0] = n
@@ -101,10 +101,10 @@ def _pick_rows(valid: Bool, drawn: Float, order: Int, bounds: Int, start: Int, p
                 if not valid[s, p]:
                     continue
                 place = n  # insertion by the number drawn
-                while place > first and drawn[s, picked[place - 1]] > drawn[s, p]:
-                    picked[place] = picked[place - 1]
+                while place > first and drawn[s, entry_rows[place - 1]] > drawn[s, p]:
+                    entry_rows[place] = entry_rows[place - 1]
                     place -= 1
-                picked[place] = p
+                entry_rows[place] = p
                 n += 1
             start[s, f + 1] = n
 

@@ -102,10 +102,10 @@ class ListFusion(Fusion):
 
     @property
     def looks_back_s(self) -> float:
-        """Which lists that arrived before a time chunk it needs once more, beside those in `newest`.
+        """Seconds that lists of an earlier time chunk stay needed, beside those in `newest`.
 
-        Those captured at most so long before the newest capture that had arrived by then: the others have no entries.
-        It counts from that capture, not from the time chunk's first instant, since all lists may come late.
+        A list is needed if it was captured at most so long before the newest capture that had arrived by the chunk's
+        begin. The time counts from that capture, not from the chunk's first instant, since all lists may come late.
         """
         return 0.0
 
@@ -219,15 +219,15 @@ def _check_lists(answer: ObjectLists, fusion: ListFusion, inputs: Inputs, where:
     return answer
 
 
-def pair_problem(given: object) -> str | None:
-    """What is wrong with the form of the answer of `resume`; None: it is a pair."""
-    if isinstance(given, tuple) and len(given) == 2:
+def pair_problem(answer: object) -> str | None:
+    """The problem with the form of the answer of `resume`; None: it is a pair."""
+    if isinstance(answer, tuple) and len(answer) == 2:
         return None
-    return f"resume: expected ObjectLists and a memory, found {type(given).__name__}"
+    return f"resume: expected ObjectLists and a memory, found {type(answer).__name__}"
 
 
 def form_problem(answer: object, inputs: Inputs) -> str | None:
-    """What is wrong with the form of the lists a fusion gave; None: nothing."""
+    """The problem with the form of the lists that a fusion returned; None: there is none."""
     shape = (len(inputs.lists.start), len(inputs.issue_s) + 1)
     if not isinstance(answer, ObjectLists):
         return f"fuse: expected Lists, found {type(answer).__name__}"
@@ -244,7 +244,7 @@ def form_problem(answer: object, inputs: Inputs) -> str | None:
 
 
 def content_problem(answer: ObjectLists, inputs: Inputs) -> str | None:
-    """What is wrong with the entries of lists of the right form; None: nothing."""
+    """The problem with the entries of lists in a valid form; None: there is none."""
     if not np.isfinite(view_as_numbers(answer.entries)[:, :NUMBERS]).all():
         name = next(each for each in ENTRY.names or () if not np.isfinite(answer.entries[each]).all())
         return f"{name}: expected numbers, found NaN or infinity"
@@ -339,12 +339,12 @@ class RecordedFusion(ListFusion):
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
         """At each instant the newest list that arrives; `unit_ix` is −1, as no unit contributes."""
-        which = np.array([_newest_list(inputs, k) for k in range(len(inputs.issue_s))], dtype=np.int64)
+        newest = np.array([_newest_list(inputs, k) for k in range(len(inputs.issue_s))], dtype=np.int64)
         begin = inputs.lists.start
-        lengths = (begin[:, 1:] - begin[:, :-1])[:, which]
+        lengths = (begin[:, 1:] - begin[:, :-1])[:, newest]
         ends = np.cumsum(lengths.ravel()).reshape(lengths.shape)
         start = np.concatenate([np.append(0, ends[:-1, -1:].ravel())[:, None], ends], axis=1)
-        first = np.repeat(begin[:, :-1][:, which].ravel() - (ends - lengths).ravel(), lengths.ravel())
+        first = np.repeat(begin[:, :-1][:, newest].ravel() - (ends - lengths).ravel(), lengths.ravel())
         entries = inputs.lists.entries[first + np.arange(len(first))]
         entries["unit_ix"] = -1
         _drop_repeated_tracks(entries, np.repeat(np.arange(lengths.size), lengths.ravel()))

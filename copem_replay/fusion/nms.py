@@ -50,7 +50,7 @@ class Nms(ListFusion):
             if self.by == "iou":
                 reach_m = np.hypot(entries["length_m"], entries["width_m"]) / 2
             place = np.stack([entries["x_m"], entries["y_m"], reach_m])
-            start, kept = _suppress_overlapping(
+            start, kept_rows = _suppress_overlapping(
                 entries,
                 place,
                 kind,
@@ -61,7 +61,7 @@ class Nms(ListFusion):
                 self.by == "iou",
                 self.iou,
             )
-            runs.append((start, entries[kept]))
+            runs.append((start, entries[kept_rows]))
         fused = join_runs(runs, len(inputs.issue_s))
         fused.entries["track_id"] = -1
         return fused
@@ -89,7 +89,7 @@ def _suppress_overlapping(
 
     `place (3, N)`: x, y and reach.
     """
-    kept, kept_start = np.empty_like(rows), np.zeros_like(start)
+    kept_rows, kept_start = np.empty_like(rows), np.zeros_like(start)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     n = 0
@@ -97,7 +97,7 @@ def _suppress_overlapping(
         for r in order[np.sort(rank[rows[start[k] : start[k + 1]]])]:
             free = True
             for q in range(kept_start[k], n):
-                s = kept[q]
+                s = kept_rows[q]
                 dx, dy, reach = place[0, r] - place[0, s], place[1, r] - place[1, s], place[2, r] + place[2, s]
                 if dx * dx + dy * dy > reach * reach or not agree[kind[r], kind[s]]:
                     continue
@@ -105,10 +105,10 @@ def _suppress_overlapping(
                     free = False
                     break
             if free:
-                kept[n] = r
+                kept_rows[n] = r
                 n += 1
         kept_start[k + 1] = n
-    return kept_start, kept[:n].copy()
+    return kept_start, kept_rows[:n].copy()
 
 
 @callee

@@ -107,7 +107,7 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
     weight = np.full(n, 1.0 / n)
     if n == 1:
         return weight
-    has = np.ones(n, dtype=np.bool_)
+    weighted = np.ones(n, dtype=np.bool_)
     information, total, P = np.zeros((n, d, d)), np.empty((d, d)), np.empty((d, d))
     lever, score, bend = np.empty((n, d, d)), np.empty(n), np.empty(n)
     value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
@@ -120,15 +120,15 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
             break
         enters = -1
         for k in range(n):
-            if has[k]:
+            if weighted[k]:
                 off = max(off, abs(score[k] / mean - 1))
             elif enters < 0 or score[k] > score[enters]:
                 enters = k
         if off <= _GAP:
             if enters < 0 or score[enters] <= (1 + _GAP) * mean:
                 break
-            has[enters] = True
-        change = _newton_step(lever, score / mean, bend / mean, has, P, mean, by_determinant)
+            weighted[enters] = True
+        change = _newton_step(lever, score / mean, bend / mean, weighted, P, mean, by_determinant)
         longest, fall = np.inf, 0.0
         for k in range(n):
             fall += score[k] * change[k]
@@ -145,8 +145,8 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
             step /= 2
         for k in range(n):
             gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
-            has[k] = has[k] and not gone
-            weight[k] = max(weight[k] + step * change[k], 0.0) if has[k] else 0.0
+            weighted[k] = weighted[k] and not gone
+            weight[k] = max(weight[k] + step * change[k], 0.0) if weighted[k] else 0.0
         weight /= weight.sum()
         value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
     return weight
@@ -218,10 +218,10 @@ def _derive_terms(
 
 @callee
 def _newton_step(
-    lever: Float, score: Float, bend: Float, has: Bool, P: Float, mean: float, by_determinant: bool
+    lever: Float, score: Float, bend: Float, weighted: Bool, P: Float, mean: float, by_determinant: bool
 ) -> Float:
     """Newton's change of the weights (n,), its sum 0; inputs without weight keep none. Scores and bends over `mean`."""
-    active = np.flatnonzero(has)
+    active = np.flatnonzero(weighted)
     c, d = len(active), len(P)
     curvature, root, half = np.empty((c, c)), np.empty((c, c)), np.empty((d, d))
     largest = 0.0
@@ -242,7 +242,7 @@ def _newton_step(
     invert_root(curvature, root)
     gain, ones_solved = solve_with_root(root, score[active] - 1), solve_with_root(root, np.ones(c))
     shift = gain.sum() / ones_solved.sum()  # so that the changes sum to 0
-    change = np.zeros(len(has))
+    change = np.zeros(len(weighted))
     for p in range(c):
         change[active[p]] = gain[p] - shift * ones_solved[p]
     return change

@@ -37,7 +37,7 @@ from copem_replay.fusion.interface import (
 def needed_lists(
     captured_s: Float, instants: FusionSchedule | Inputs, first: int, after: int, looks_back_s: float
 ) -> Bool:
-    """(F,) lists whose entries are needed at the instants `first` … `after` − 1; `captured_s (F,)`: their captures.
+    """Mask (F,) of the lists that the instants `first` … `after` − 1 need; `captured_s (F,)`: their captures.
 
     The units' newest, those that arrive, and, where `ListFusion.looks_back_s` is not 0, those that have arrived before
     and were captured at most so long before the newest of them.
@@ -58,15 +58,15 @@ def needed_lists(
 
 
 def cut_chunk(inputs: Inputs, first: int, after: int, looks_back_s: float) -> Inputs:
-    """The input at the instants `first` … `after` − 1, with the entries of the lists alone that they need."""
+    """The input at the instants `first` … `after` − 1, with only the entries of needed lists."""
     needed = needed_lists(inputs.captured_s, inputs, first, after, looks_back_s)
     start, entries = inputs.lists.start, inputs.lists.entries
     lengths = np.where(needed, np.diff(start), 0)
-    kept = np.repeat(np.tile(needed, len(start)), np.diff(start).ravel())
+    is_needed = np.repeat(np.tile(needed, len(start)), np.diff(start).ravel())
     begin = inputs.arrived_start[first]
     return replace(
         inputs,
-        lists=ObjectLists(_list_starts(lengths), entries[kept]),
+        lists=ObjectLists(_list_starts(lengths), entries[is_needed]),
         issue_s=inputs.issue_s[first:after],
         newest=inputs.newest[first:after],
         arrived=inputs.arrived[begin : inputs.arrived_start[after]],
@@ -108,7 +108,7 @@ _SCENES: tuple[tuple[str, int, int, float, int, float, float], ...] = (
 
 @dataclass(frozen=True)
 class SmallScene:
-    """The lists of units: `said[s][f]` are the entries of list f in run `runs[s]`."""
+    """The lists of units: `said[s][f]` has the entries of list f in run `runs[s]`."""
 
     name: str
     units: tuple[str, ...]
@@ -137,7 +137,7 @@ class SmallScene:
         return make_inputs(received, ObjectLists(start, entries), max_age_s=1.0)
 
     def of_runs(self, runs: Sequence[int]) -> SmallScene:
-        """The scene with the runs `runs`, in this order."""
+        """The scene in the runs `runs`, in this order."""
         return replace(self, runs=runs, said=tuple(self.said[s] for s in runs))
 
     def of_lists(self, lists: Int) -> SmallScene:
@@ -152,7 +152,7 @@ class SmallScene:
         return replace(scene, units=tuple(self.units[u] for u in order), unit_ix=place[scene.unit_ix])
 
     def beside(self, unit: str) -> SmallScene:
-        """The scene with one more unit, of which nothing arrives."""
+        """The scene with one more unit, from which no list arrives."""
         count = len(self.unit_ix)
         scene = self.of_lists(np.tile(np.arange(count), 2))
         scene.unit_ix[count:], scene.arrives_s[count:] = len(self.units), np.inf
@@ -189,7 +189,7 @@ def make_small_scenes(seed: int) -> list[SmallScene]:
 
 
 def _make_scene(
-    rng: np.random.Generator, name: str, units: int, n: int, width_m: float, lists: int, late_s: float, lost: float
+    rng: np.random.Generator, name: str, units: int, n: int, width_m: float, lists: int, late_s: float, p_lost: float
 ) -> SmallScene:
     unit_ix = np.repeat(np.arange(units), lists)
     # Every other unit captures at the same instants.
@@ -197,9 +197,9 @@ def _make_scene(
     captured_s = np.tile(np.arange(lists) * 0.1, units) + phase_s[unit_ix]
     # Several at one instant, also of one unit; of two units never quite: the units' order must not matter.
     arrives_s = np.ceil((captured_s + rng.uniform(0.0, late_s, len(unit_ix))) / 0.05) * 0.05 + 5e-8 * unit_ix
-    arrives_s[rng.random(len(unit_ix)) < lost] = np.inf
+    arrives_s[rng.random(len(unit_ix)) < p_lost] = np.inf
     place_m, speed_mps = rng.uniform(0.0, width_m, (2, n)), rng.normal(0.0, 3.0, (2, n))
-    likely = 0.8 * np.eye(len(CLASSES))[rng.integers(0, 4, n)] + 0.2 / len(CLASSES)
+    class_shares = 0.8 * np.eye(len(CLASSES))[rng.integers(0, 4, n)] + 0.2 / len(CLASSES)
 
     def listed(f: int) -> Entries:
         entries = entries_of(n)
@@ -210,11 +210,11 @@ def _make_scene(
         entries["cov_ee_m2"], entries["cov_nn_m2"] = rng.uniform(0.1, 0.5, (2, n))
         entries["cov_en_m2"] = rng.uniform(-0.5, 0.5, n) * np.sqrt(entries["cov_ee_m2"] * entries["cov_nn_m2"])
         entries["existence"], entries["track_id"] = rng.uniform(0.5, 1.0, n), np.arange(n)
-        entries["class_probability"] = likely
+        entries["class_probability"] = class_shares
         return rng.permutation(entries[rng.random(n) < 0.8])
 
-    said = tuple(tuple(listed(f) for f in range(len(unit_ix))) for _ in range(3))
-    return SmallScene(name, tuple("ABCDEFGHIJKL"[:units]), unit_ix, captured_s, arrives_s, range(3), said)
+    run_lists = tuple(tuple(listed(f) for f in range(len(unit_ix))) for _ in range(3))
+    return SmallScene(name, tuple("ABCDEFGHIJKL"[:units]), unit_ix, captured_s, arrives_s, range(3), run_lists)
 
 
 FUSION_RULES = {
@@ -241,9 +241,9 @@ class NonconformingError(AssertionError):
     'again'
     """
 
-    def __init__(self, rule: str, kind: str, where: str, said: str) -> None:
+    def __init__(self, rule: str, kind: str, where: str, text: str) -> None:
         self.rule = rule
-        super().__init__(f"{kind} breaks the rule {rule!r}: {FUSION_RULES[rule]}. {where}: {said}.")
+        super().__init__(f"{kind} breaks the rule {rule!r}: {FUSION_RULES[rule]}. {where}: {text}.")
 
 
 @dataclass(frozen=True, repr=False)
@@ -260,12 +260,12 @@ class KeptRules:
     seed: int
 
     def __repr__(self) -> str:
-        kept = [f"{rule} ({times})" for rule, times in self.asked.items() if times]
-        left = [rule for rule, times in self.asked.items() if not times]
-        said = (
-            f"{self.kind} keeps {len(kept)} rules in {len(self.scenes)} scenes of seed {self.seed}: {', '.join(kept)}"
+        rules = [f"{rule} ({times})" for rule, times in self.asked.items() if times]
+        unasked = [rule for rule, times in self.asked.items() if not times]
+        text = (
+            f"{self.kind} keeps {len(rules)} rules in {len(self.scenes)} scenes of seed {self.seed}: {', '.join(rules)}"
         )
-        return said + (f"; not asked: {', '.join(left)}" if left else "")
+        return text + (f"; not asked: {', '.join(unasked)}" if unasked else "")
 
 
 def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool = True) -> KeptRules:
@@ -282,8 +282,8 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
     Traceback (most recent call last):
     copem_replay.fusion.testing.NonconformingError: my_package.fusions:Silent breaks the rule 'silence': ...
     """
-    asked = dict.fromkeys(FUSION_RULES, 0)
-    trials = [_FusionTrial(fusion, scene, asked) for scene in make_small_scenes(seed)]
+    counts = dict.fromkeys(FUSION_RULES, 0)
+    trials = [_FusionTrial(fusion, scene, counts) for scene in make_small_scenes(seed)]
     firsts = [trial.answer(trial.scene) for trial in trials]
     for number, (trial, first) in enumerate(zip(trials, firsts, strict=True)):
         scene, rng = trial.scene, np.random.default_rng((seed, number, 1))
@@ -303,10 +303,10 @@ def check_fusion(fusion: ListFusion, *, seed: int = 0, units_in_any_order: bool 
         if units_in_any_order:
             other = scene.of_units(rng.permutation(len(scene.units)))
             trial.same("order of units", first, other, f"units in the order {', '.join(other.units)}")
-    asked["silence"] = len(firsts)
+    counts["silence"] = len(firsts)
     if not any(len(first.entries) for first in firsts):
         raise NonconformingError("silence", fusion.kind, f"All scenes of seed {seed}", "expected entries, found none")
-    return KeptRules(fusion.kind, tuple(trial.scene.name for trial in trials), asked, seed)
+    return KeptRules(fusion.kind, tuple(trial.scene.name for trial in trials), counts, seed)
 
 
 @dataclass(frozen=True)
@@ -317,9 +317,9 @@ class _FusionTrial:
     scene: SmallScene
     asked: dict[str, int]
 
-    def broken(self, rule: str, scene: SmallScene, said: object, s: int = -1, now_s: float = 0.0) -> NonconformingError:
+    def broken(self, rule: str, scene: SmallScene, text: object, s: int = -1, now_s: float = 0.0) -> NonconformingError:
         when = f", run {scene.runs[s]}, instant {now_s:.3f} s" if s >= 0 else ""
-        return NonconformingError(rule, self.fusion.kind, f"Scene {scene.name!r}{when}", str(said))
+        return NonconformingError(rule, self.fusion.kind, f"Scene {scene.name!r}{when}", str(text))
 
     def answer(self, scene: SmallScene) -> ObjectLists:
         """The lists that the fusion gives for a scene, checked."""
@@ -368,25 +368,25 @@ class _FusionTrial:
             parts.append(lists)
         self.compare("chunks", first, join_chunks(parts), scene, np.inf)
 
-    def compare(self, rule: str, first: ObjectLists, found: ObjectLists, scene: SmallScene, until_s: float) -> None:
+    def compare(self, rule: str, first: ObjectLists, answer: ObjectLists, scene: SmallScene, until_s: float) -> None:
         """Check that the lists found for a scene are those of `first`: as sets, or to the last bit."""
         self.asked[rule] += 1
         issue_s = scene.inputs().issue_s
         exact = rule in ("again", "runs", "chunks")
         unit_number = np.array([*map((*self.scene.units, *scene.units).index, scene.units), -1])
         for s, run in enumerate(scene.runs):
-            called: dict[tuple[str, int], int] = {}
+            track_map: dict[tuple[str, int], int] = {}
             for k, now_s in enumerate(issue_s[issue_s <= until_s].tolist()):
-                expected, listed = first.of(run, k), found.of(s, k)
+                expected, listed = first.of(run, k), answer.of(s, k)
                 if exact and listed.tobytes() == expected.tobytes():
                     continue
-                said = _describe_difference(
-                    expected, replace_columns(listed, unit_ix=unit_number[listed["unit_ix"]]), called
+                text = _describe_difference(
+                    expected, replace_columns(listed, unit_ix=unit_number[listed["unit_ix"]]), track_map
                 )
-                if said is None and exact:
-                    said = "expected the bytes of the scene itself, found another order, other track ids or last digits"
-                if said is not None:
-                    raise self.broken(rule, scene, said, s, now_s)
+                if text is None and exact:
+                    text = "expected the bytes of the scene itself, found another order, other track ids or last digits"
+                if text is not None:
+                    raise self.broken(rule, scene, text, s, now_s)
 
 
 def _content_bytes(inputs: Inputs) -> dict[str, bytes]:
@@ -400,21 +400,21 @@ def _failed_step(fusion: StepFusion, inputs: Inputs) -> tuple[str, int, float] |
     for s, k in np.ndindex(len(inputs.lists.start), len(inputs.issue_s)):
         try:
             entries, memory = fusion.step(float(inputs.issue_s[k]), make_inbox(inputs, s, k), memory if k else None)
-            found = f"{type(entries).__name__} of {np.asarray(entries).dtype.name}"
+            outcome = f"{type(entries).__name__} of {np.asarray(entries).dtype.name}"
         except Exception as error:
-            entries, found = None, f"{type(error).__name__}: {error}"
+            entries, outcome = None, f"{type(error).__name__}: {error}"
         if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY:
-            return f"expected entries of ENTRY and memory from step, found {found}", s, float(inputs.issue_s[k])
+            return f"expected entries of ENTRY and memory from step, found {outcome}", s, float(inputs.issue_s[k])
     return None
 
 
-def _describe_difference(expected: Entries, found: Entries, called: dict[tuple[str, int], int]) -> str | None:
-    """How two lists differ as sets; None: not at all. Track ids may differ: `called` maps those seen so far."""
-    if len(found) != len(expected):
-        return f"expected {len(expected)} entries as in the scene itself, found {len(found)}"
+def _describe_difference(expected: Entries, actual: Entries, track_map: dict[tuple[str, int], int]) -> str | None:
+    """How two lists differ as sets; None: not at all. Track ids may differ: `track_map` maps those seen so far."""
+    if len(actual) != len(expected):
+        return f"expected {len(expected)} entries as in the scene itself, found {len(actual)}"
     a, b = (
         entries[np.lexsort((entries["unit_ix"], entries["y_m"].round(6), entries["x_m"].round(6)))]
-        for entries in (expected, found)
+        for entries in (expected, actual)
     )
     for name in (*VALUES, *COVARIANCES, "existence", "class_probability", "captured_s", "unit_ix"):
         difference = wrap_angles(a[name] - b[name]) if name == "yaw_rad" else a[name] - b[name]
@@ -422,7 +422,7 @@ def _describe_difference(expected: Entries, found: Entries, called: dict[tuple[s
             i = np.argmax(other)
             return f"{name}: expected {a[name].flat[i]:.12g} as in the scene itself, found {b[name].flat[i]:.12g}"
     for was, now in zip(a["track_id"].tolist(), b["track_id"].tolist(), strict=True):
-        one_to_one = called.setdefault(("was", was), now) == now and called.setdefault(("now", now), was) == was
+        one_to_one = track_map.setdefault(("was", was), now) == now and track_map.setdefault(("now", now), was) == was
         if not one_to_one or (was < 0) != (now < 0):
             return f"track_id: expected what was {was} to be one track, and no other to be called so, found {now}"
     return None

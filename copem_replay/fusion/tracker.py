@@ -85,7 +85,7 @@ class Tracker(ListFusion):
 
     @property
     def looks_back_s(self) -> float:
-        """How far back (s) lists are received again."""
+        """Seconds for which earlier lists are received again."""
         return self.buffer_s if self.late == "replay" else 0.0
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
@@ -117,11 +117,11 @@ def _select_arrivals(inputs: Inputs) -> tuple[Int, Int]:
     """(A,) lists that arrive before any newer one of their unit, and (K + 1,) where those of each instant begin."""
     instant = np.repeat(np.arange(len(inputs.issue_s)), np.diff(inputs.arrived_start))
     newest = inputs.newest[instant, inputs.unit_ix[inputs.arrived]]
-    kept = newest == inputs.arrived
+    in_order = newest == inputs.arrived
     if inputs.keeps_s is not None:  # `newest` of a unit with partial messages is no list that arrived
-        kept |= (newest >= 0) & (inputs.captured_s[newest] == inputs.captured_s[inputs.arrived])
-    start = np.append(0, np.cumsum(np.bincount(instant[kept], minlength=len(inputs.issue_s))))
-    return inputs.arrived[kept], start.astype(np.int64)
+        in_order |= (newest >= 0) & (inputs.captured_s[newest] == inputs.captured_s[inputs.arrived])
+    start = np.append(0, np.cumsum(np.bincount(instant[in_order], minlength=len(inputs.issue_s))))
+    return inputs.arrived[in_order], start.astype(np.int64)
 
 
 def _gather_lists(inputs: Inputs, run: int) -> HeardLists:

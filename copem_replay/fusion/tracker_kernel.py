@@ -49,7 +49,7 @@ No claim yet: 0, −inf."""
 
 
 class TrackerMemory(NamedTuple):
-    """Memory from one instant to the next; tracks stand in the order in which they were founded."""
+    """The tracker's state from one instant to the next; tracks stand in the order in which they were founded."""
 
     tracks: NDArray[Any]  # (T,) of TRACK
     claims: NDArray[Any]  # (T, U) of CLAIM
@@ -57,7 +57,7 @@ class TrackerMemory(NamedTuple):
 
 
 class StoredMemory(NamedTuple):
-    """Memory from one time chunk of instants to the next; all but `memory` is for `late: replay` alone.
+    """The tracker's state from one time chunk to the next; all but `memory` serves `late: replay` alone.
 
     Lists captured at one instant have one memory before them. These are stored instant after instant: of instant b the
     next `sizes[b]` of `tracks` and `claims`, and the square of that of `together_s`.
@@ -80,7 +80,7 @@ def empty_memory(units: int) -> StoredMemory:
 
 @callee
 def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
-    """A copy of the memory, the memory before each of the lists received of late, and these lists."""
+    """A copy of the state, the state before each of the recently received lists, and these lists."""
     memory = _copy_memory(so_far.memory)
     before = [memory]
     before.pop()
@@ -100,7 +100,7 @@ def recall_memory(so_far: StoredMemory, captured_s: Float) -> tuple[TrackerMemor
 
 @callee
 def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: Int, captured_s: Float) -> StoredMemory:
-    """What `recall_memory` gives, in the form in which it is stored."""
+    """The result of `recall_memory` in the form in which it is stored."""
     first = np.empty(len(received), np.int64)
     instants = tracks = pairs = 0
     for h in range(len(received)):
@@ -108,7 +108,7 @@ def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: I
             first[instants] = h
             n = len(before[h].tracks)
             instants, tracks, pairs = instants + 1, tracks + n, pairs + n * n
-    kept = StoredMemory(
+    stored = StoredMemory(
         memory, received.copy(), np.empty(instants, np.int64), np.empty(tracks, TRACK),
         np.empty((tracks, memory.claims.shape[1]), CLAIM), np.empty(pairs),
     )  # fmt: skip
@@ -116,11 +116,11 @@ def store_memory(memory: TrackerMemory, before: list[TrackerMemory], received: I
     for b in range(instants):
         memory_before = before[first[b]]
         n = len(memory_before.tracks)
-        kept.sizes[b] = n
-        kept.tracks[track : track + n], kept.claims[track : track + n] = memory_before.tracks, memory_before.claims
-        kept.together_s[pair : pair + n * n] = memory_before.together_s.copy().reshape(n * n)
+        stored.sizes[b] = n
+        stored.tracks[track : track + n], stored.claims[track : track + n] = memory_before.tracks, memory_before.claims
+        stored.together_s[pair : pair + n * n] = memory_before.together_s.copy().reshape(n * n)
         track, pair = track + n, pair + n * n
-    return kept
+    return stored
 
 
 @callee
@@ -140,7 +140,7 @@ def _copy_memory(memory: TrackerMemory) -> TrackerMemory:
 
 @callee
 def propagate_covariance(P: Float, dt_s: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: P ← F P Fᵀ, in place, without acceleration."""
+    """Advance a covariance by `dt_s` ≥ 0 without acceleration: P ← F P Fᵀ, in place."""
     for i in range(2):
         for j in range(2):
             P[i, j] += dt_s * (P[i, 2 + j] + P[2 + i, j]) + dt_s * dt_s * P[2 + i, 2 + j]
@@ -152,7 +152,7 @@ def propagate_covariance(P: Float, dt_s: float) -> None:
 
 @callee
 def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
-    """Lets `dt_s` ≥ 0 pass: x ← F x, P ← F P Fᵀ + Q."""
+    """Advance a state by `dt_s` ≥ 0: x ← F x, P ← F P Fᵀ + Q."""
     for i in range(2):
         state[i] += dt_s * state[2 + i]
     propagate_covariance(P, dt_s)
@@ -165,7 +165,7 @@ def predict_state(state: Float, P: Float, dt_s: float, q_m2ps3: float) -> None:
 
 @callee
 def update_state(state: Float, P: Float, x_m: float, y_m: float, ee: float, en: float, nn: float) -> None:
-    """Takes in a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
+    """Update a state by a measured position: x ← x + K ν, P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ."""
     a, b, d = P[0, 0] + ee, P[0, 1] + en, P[1, 1] + nn
     det = a * d - b * b
     k_x = _gain_column(P, d / det, -b / det)
@@ -230,71 +230,71 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 @callee
-def update_split(state: Float, P: Float, common: Float, seen: Float, share: float, grown: float) -> None:
-    """Takes in a measured position, in place. `seen`: x, y, ee, en, nn; the independent part of R counts `grown` times.
+def update_split(state: Float, P: Float, common: Float, z: Float, share: float, grown: float) -> None:
+    """Update a state by a position, in place. `z`: x, y, ee, en, nn; the independent part of R counts `grown` times.
 
     `grown`: from 1 to infinity, where the measurement tells nothing new but its common part.
     """
-    own = (1.0 - share) * min(grown, 1e12)
+    own_share = (1.0 - share) * min(grown, 1e12)
     # The determinant is convex in ω: golden sections between its ends, which are then held against the best.
     low, high = _LEAST, 1.0 - _LEAST
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = (
-        _updated_determinant(left, P, common, seen, share, own),
-        _updated_determinant(right, P, common, seen, share, own),
+        _updated_determinant(left, P, common, z, share, own_share),
+        _updated_determinant(right, P, common, z, share, own_share),
     )
     for _ in range(_ROUNDS):
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)
-            at_left = _updated_determinant(left, P, common, seen, share, own)
+            at_left = _updated_determinant(left, P, common, z, share, own_share)
         else:
             low, left, at_left = left, right, at_right
             right = low + _GOLDEN * (high - low)
-            at_right = _updated_determinant(right, P, common, seen, share, own)
+            at_right = _updated_determinant(right, P, common, z, share, own_share)
     omega = (low + high) / 2
     if omega >= 1.0 - 2.0 * _LEAST:  # the measurement would not help: it is left out
         return
-    independent, whole = np.empty((4, 4)), np.empty((4, 4))
+    independent, inflated = np.empty((4, 4)), np.empty((4, 4))
     for i in range(4):
         for j in range(4):
             independent[i, j] = P[i, j] - common[i, j]
-            whole[i, j] = common[i, j] / omega + independent[i, j]
-    scale = share / (1.0 - omega) + own
-    gain = _split_gain(whole, scale * seen[2], scale * seen[3], scale * seen[4])
-    update_state(state, whole, seen[0], seen[1], scale * seen[2], scale * seen[3], scale * seen[4])
-    left_over = _update_covariance(independent, gain, own * seen[2], own * seen[3], own * seen[4])
+            inflated[i, j] = common[i, j] / omega + independent[i, j]
+    scale = share / (1.0 - omega) + own_share
+    gain = _split_gain(inflated, scale * z[2], scale * z[3], scale * z[4])
+    update_state(state, inflated, z[0], z[1], scale * z[2], scale * z[3], scale * z[4])
+    left_over = _update_covariance(independent, gain, own_share * z[2], own_share * z[3], own_share * z[4])
     for i in range(4):
         for j in range(4):
-            P[i, j] = whole[i, j]
-            common[i, j] = whole[i, j] - left_over[i, j]
+            P[i, j] = inflated[i, j]
+            common[i, j] = inflated[i, j] - left_over[i, j]
 
 
 @callee
-def _updated_determinant(omega: float, P: Float, common: Float, seen: Float, share: float, own: float) -> float:
+def _updated_determinant(omega: float, P: Float, common: Float, z: Float, share: float, own_share: float) -> float:
     """The determinant of P after the update: |P₁| |R₁| / |HP₁Hᵀ + R₁|, P₁ by blocks of position and velocity."""
-    more, scale = 1.0 / omega - 1.0, share / (1.0 - omega) + own
-    a, b, d = P[0, 0] + more * common[0, 0], P[0, 1] + more * common[0, 1], P[1, 1] + more * common[1, 1]
+    factor, scale = 1.0 / omega - 1.0, share / (1.0 - omega) + own_share
+    a, b, d = P[0, 0] + factor * common[0, 0], P[0, 1] + factor * common[0, 1], P[1, 1] + factor * common[1, 1]
     det = a * d - b * b
-    p, q = P[0, 2] + more * common[0, 2], P[1, 2] + more * common[1, 2]
-    r, s = P[0, 3] + more * common[0, 3], P[1, 3] + more * common[1, 3]
-    xx = P[2, 2] + more * common[2, 2] - (d * p * p - 2.0 * b * p * q + a * q * q) / det
-    xy = P[2, 3] + more * common[2, 3] - (d * p * r - b * (p * s + q * r) + a * q * s) / det
-    yy = P[3, 3] + more * common[3, 3] - (d * r * r - 2.0 * b * r * s + a * s * s) / det
-    ee, en, nn = scale * seen[2], scale * seen[3], scale * seen[4]
+    p, q = P[0, 2] + factor * common[0, 2], P[1, 2] + factor * common[1, 2]
+    r, s = P[0, 3] + factor * common[0, 3], P[1, 3] + factor * common[1, 3]
+    xx = P[2, 2] + factor * common[2, 2] - (d * p * p - 2.0 * b * p * q + a * q * q) / det
+    xy = P[2, 3] + factor * common[2, 3] - (d * p * r - b * (p * s + q * r) + a * q * s) / det
+    yy = P[3, 3] + factor * common[3, 3] - (d * r * r - 2.0 * b * r * s + a * s * s) / det
+    ee, en, nn = scale * z[2], scale * z[3], scale * z[4]
     measured = (ee * nn - en * en) / ((a + ee) * (d + nn) - (b + en) * (b + en))
     return float(det * (xx * yy - xy * xy) * measured)
 
 
 @callee
-def _split_gain(whole: Float, ee: float, en: float, nn: float) -> Float:
-    """The gain K = P₁Hᵀ(HP₁Hᵀ + R₁)⁻¹, (4, 2), of P₁ `whole` and R₁ = (ee, en; en, nn)."""
-    a, b, d = whole[0, 0] + ee, whole[0, 1] + en, whole[1, 1] + nn
+def _split_gain(inflated: Float, ee: float, en: float, nn: float) -> Float:
+    """The gain K = P₁Hᵀ(HP₁Hᵀ + R₁)⁻¹, (4, 2), of P₁ `inflated` and R₁ = (ee, en; en, nn)."""
+    a, b, d = inflated[0, 0] + ee, inflated[0, 1] + en, inflated[1, 1] + nn
     det = a * d - b * b
     gain = np.empty((4, 2))
     for i in range(4):
-        gain[i, 0] = (whole[i, 0] * d - whole[i, 1] * b) / det
-        gain[i, 1] = (whole[i, 1] * a - whole[i, 0] * b) / det
+        gain[i, 0] = (inflated[i, 0] * d - inflated[i, 1] * b) / det
+        gain[i, 1] = (inflated[i, 1] * a - inflated[i, 0] * b) / det
     return gain
 
 
@@ -341,7 +341,7 @@ class HeardLists(NamedTuple):
 
 
 class TrackerRules(NamedTuple):
-    """The settings of the tracker, in the form that the kernel takes."""
+    """The settings of the tracker as numbers and arrays for the kernel."""
 
     late: int
     q_m2ps3: float
@@ -363,7 +363,7 @@ class TrackerRules(NamedTuple):
 def track_run(
     unit_lists: HeardLists, rules: TrackerRules, so_far: StoredMemory, issue_s: Float, arrived: Int, arrived_start: Int
 ) -> tuple[Int, Entries, StoredMemory]:
-    """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and what to remember."""
+    """Fused lists of one run at the next instants: where each begins (K + 1,), their entries, and the next state."""
     memory, before, received = recall_memory(so_far, unit_lists.captured_s)
     start, entries = np.zeros(len(issue_s) + 1, np.int64), np.zeros(256, ENTRY)
     for k in range(len(issue_s)):
@@ -401,26 +401,26 @@ def _replay_memory(
         arriving = arriving[unit_lists.captured_s[arriving] >= oldest_s]
     if len(arriving) == 0:
         return memory, before, received
-    back = len(received)
-    while back > 0 and unit_lists.captured_s[received[back - 1]] >= unit_lists.captured_s[arriving[0]]:
-        back -= 1
-    while len(before) > back:
+    first_again = len(received)
+    while first_again > 0 and unit_lists.captured_s[received[first_again - 1]] >= unit_lists.captured_s[arriving[0]]:
+        first_again -= 1
+    while len(before) > first_again:
         memory = before.pop()
-    again = _order_by_capture(unit_lists, np.concatenate((received[back:], arriving)))
-    received = np.concatenate((received[:back], again))
-    for k in range(len(again)):
-        now_s = unit_lists.captured_s[again[k]]
-        if k == 0 or unit_lists.captured_s[again[k - 1]] < now_s:
+    replayed = _order_by_capture(unit_lists, np.concatenate((received[first_again:], arriving)))
+    received = np.concatenate((received[:first_again], replayed))
+    for k in range(len(replayed)):
+        now_s = unit_lists.captured_s[replayed[k]]
+        if k == 0 or unit_lists.captured_s[replayed[k - 1]] < now_s:
             saved = memory
             memory = TrackerMemory(saved.tracks.copy(), saved.claims.copy(), saved.together_s.copy())
         before.append(saved)
-        memory = _hear_list(memory, unit_lists, rules, again[k], now_s)
-        if k + 1 == len(again) or unit_lists.captured_s[again[k + 1]] > now_s:
+        memory = _hear_list(memory, unit_lists, rules, replayed[k], now_s)
+        if k + 1 == len(replayed) or unit_lists.captured_s[replayed[k + 1]] > now_s:
             memory = _settle_tracks(memory, rules, now_s)
-    done = 0
-    while unit_lists.captured_s[received[done]] < unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S:
-        done += 1
-    return memory, before[done:], received[done:]
+    skip = 0
+    while unit_lists.captured_s[received[skip]] < unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S:
+        skip += 1
+    return memory, before[skip:], received[skip:]
 
 
 @callee
@@ -464,19 +464,19 @@ def _hear_list(
                 propagate_covariance(track.common, now_s - track.at_s)
             track.at_s = now_s
     claimed_s = now_s if rules.late == STALE else unit_lists.captured_s[f]
-    seen = _entry_positions(unit_lists, rules, f, now_s)
+    z = _entry_positions(unit_lists, rules, f, now_s)
     rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
-    partner = _assign_entries(memory.tracks, unit_lists, rules, rows, seen)
+    partner = _assign_entries(memory.tracks, unit_lists, rules, rows, z)
     count = len(memory.tracks)
     memory = _make_room(memory, int((partner < 0).sum()))
     for i in range(len(rows)):
         entry, x, y, ee, en, nn = (
             unit_lists.entries[rows[i]],
-            seen[i, 0],
-            seen[i, 1],
-            seen[i, 2],
-            seen[i, 3],
-            seen[i, 4],
+            z[i, 0],
+            z[i, 1],
+            z[i, 2],
+            z[i, 3],
+            z[i, 4],
         )
         if partner[i] >= 0:
             track = memory.tracks[partner[i]]
@@ -487,7 +487,7 @@ def _hear_list(
                 grown = math.tanh(abs(claimed_s - last_s) / (2.0 * rules.errors_last_s))
                 grown = 1.0 / grown if grown > 0.0 else math.inf
             if rules.common_share > 0.0:
-                update_split(track.state, track.P, track.common, seen[i], rules.common_share, grown)
+                update_split(track.state, track.P, track.common, z[i], rules.common_share, grown)
             elif grown < _NOTHING_NEW:
                 update_state(track.state, track.P, x, y, grown * ee, grown * en, grown * nn)
         else:
@@ -512,22 +512,22 @@ def _hear_list(
 def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float) -> Float:
     """Places and their covariances (n, 5): x, y, ee, en, nn of the entries of list f as of `now_s`."""
     rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
-    seen = np.empty((len(rows), 5))
+    z = np.empty((len(rows), 5))
     age_of_information_s = max(now_s - unit_lists.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
     grown = rules.q_m2ps3 * age_of_information_s**3 / 3
     for i in range(len(rows)):
         entry = unit_lists.entries[rows[i]]
-        seen[i, 0], seen[i, 1] = (
+        z[i, 0], z[i, 1] = (
             entry.x_m + age_of_information_s * entry.vx_mps,
             entry.y_m + age_of_information_s * entry.vy_mps,
         )
         ee, en, nn = floor_eigenvalues(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
-        seen[i, 2], seen[i, 3], seen[i, 4] = ee + grown, en, nn + grown
-    return seen
+        z[i, 2], z[i, 3], z[i, 4] = ee + grown, en, nn + grown
+    return z
 
 
 @callee
-def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: TrackerRules, rows: Int, seen: Float) -> Int:
+def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: TrackerRules, rows: Int, z: Float) -> Int:
     """The track of each entry (n,), −1: none. Least sum of d² + ln|S| over the pairs within the gate."""
     n, m = len(rows), len(tracks)
     partner = np.full(n, -1)
@@ -543,8 +543,8 @@ def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: Tracker
         agree = rules.agree[track.class_ix]
         x, y, ee, en, nn = track.state[0], track.state[1], track.P[0, 0], track.P[0, 1], track.P[1, 1]
         for i in range(n):
-            dx, dy = seen[i, 0] - x, seen[i, 1] - y
-            a, b, d = seen[i, 2] + ee, seen[i, 3] + en, seen[i, 4] + nn
+            dx, dy = z[i, 0] - x, z[i, 1] - y
+            a, b, d = z[i, 2] + ee, z[i, 3] + en, z[i, 4] + nn
             # No eigenvalue of S is above its trace.
             if dx * dx + dy * dy > rules.gate * (a + d) or not agree[class_ix[i]]:
                 continue
@@ -563,13 +563,13 @@ def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: Tracker
 
 
 @callee
-def _make_room(memory: TrackerMemory, more: int) -> TrackerMemory:
-    """The memory with `more` tracks at its end, which are empty."""
-    if more == 0:
+def _make_room(memory: TrackerMemory, added: int) -> TrackerMemory:
+    """The memory with `added` tracks at its end, which are empty."""
+    if added == 0:
         return memory
     n, units = memory.claims.shape
-    tracks, claims = np.zeros(n + more, TRACK), np.zeros((n + more, units), CLAIM)
-    together_s = np.full((n + more, n + more), -np.inf)
+    tracks, claims = np.zeros(n + added, TRACK), np.zeros((n + added, units), CLAIM)
+    together_s = np.full((n + added, n + added), -np.inf)
     for claim in claims[n:].flat:
         claim.at_s = -np.inf
     tracks[:n], claims[:n], together_s[:n, :n] = memory.tracks, memory.claims, memory.together_s
@@ -610,13 +610,13 @@ def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
 @callee
 def _track_existence(claims: NDArray[Any], rules: TrackerRules, now_s: float) -> float:
     """1 − Πᵤ (1 − cᵤ e^(−(now − tᵤ)/forget)) of one track, `claims (U,)`."""
-    none = 1.0
+    p_none = 1.0
     for u in range(len(claims)):
         claim = claims[u]
         if claim.existence > 0.0:
             faded_s = max(now_s - claim.at_s - rules.keeps_s[u], 0.0)
-            none *= 1.0 - claim.existence * math.exp(-faded_s / rules.forget_s)
-    return 1.0 - none
+            p_none *= 1.0 - claim.existence * math.exp(-faded_s / rules.forget_s)
+    return 1.0 - p_none
 
 
 @callee
@@ -630,14 +630,14 @@ def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> 
         for j in range(i + 1, n):
             if keep[i] and keep[j] and _is_one_object(memory, rules, i, j, now_s):
                 keep[_younger_track(memory.tracks, i, j)] = False
-    kept = np.flatnonzero(keep)
-    if len(kept) == n:
+    survivors = np.flatnonzero(keep)
+    if len(survivors) == n:
         return memory
-    tracks, claims = np.empty(len(kept), TRACK), np.empty((len(kept), units), CLAIM)
-    together_s = np.empty((len(kept), len(kept)))
-    for a in range(len(kept)):
-        tracks[a], claims[a] = memory.tracks[kept[a]], memory.claims[kept[a]]
-        together_s[a] = memory.together_s[kept[a]][kept]
+    tracks, claims = np.empty(len(survivors), TRACK), np.empty((len(survivors), units), CLAIM)
+    together_s = np.empty((len(survivors), len(survivors)))
+    for a in range(len(survivors)):
+        tracks[a], claims[a] = memory.tracks[survivors[a]], memory.claims[survivors[a]]
+        together_s[a] = memory.together_s[survivors[a]][survivors]
     return TrackerMemory(tracks, claims, together_s)
 
 
@@ -669,7 +669,7 @@ def _younger_track(tracks: NDArray[Any], i: int, j: int) -> int:
 
 @callee
 def _comes_before(unit_lists: HeardLists, f: int, g: int) -> bool:
-    """Whether list f comes before list g: see `_order_by_capture`."""
+    """Whether list f comes before list g: by capture, then the longer one, then by content, then by unit."""
     if unit_lists.captured_s[f] != unit_lists.captured_s[g]:
         return bool(unit_lists.captured_s[f] < unit_lists.captured_s[g])
     n, m = unit_lists.start[f + 1] - unit_lists.start[f], unit_lists.start[g + 1] - unit_lists.start[g]

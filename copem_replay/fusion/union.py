@@ -68,7 +68,7 @@ def join_runs(runs: Sequence[tuple[Int, Entries]], instants: int) -> ObjectLists
 
 @kernel
 def gather_newest_rows(bounds: Int, newest: Int, counts: Bool) -> tuple[Int, Int]:
-    """Where the rows of each instant begin, (K + 1,), and (R,) the rows of its newest lists that count.
+    """(K + 1,) where the rows of each instant begin, and (R,) the rows of its newest lists that count.
 
     `bounds (F + 1,)` of the lists, `newest (K, U)`, `counts (N,)`.
     """

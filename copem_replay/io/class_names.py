@@ -98,12 +98,12 @@ def class_from_name(text: str) -> str | None:
         if pair in _JOINED:
             return _JOINED[pair]
     known = {*words, *(word.removesuffix("s") for word in words), "_".join(words), "".join(words)}
-    found = next((name for name, meant in _WORDS.items() if known & set(meant)), None)
+    result = next((name for name, terms in _WORDS.items() if known & set(terms)), None)
     if known & set(_STATIC) and not known & {"worker", "officer", "person"}:
         return "other"
-    if found is None:  # `MyFiretruckModel`: words that are written together
-        found = next(
-            (name for name, meant in _WORDS.items() for one in meant if len(one) > 4 and any(one in w for w in words)),
+    if result is None:  # `MyFiretruckModel`: words that are written together
+        result = next(
+            (name for name, terms in _WORDS.items() for one in terms if len(one) > 4 and any(one in w for w in words)),
             None,
         )
-    return found
+    return result

@@ -74,19 +74,19 @@ def cut_into_pieces(
     track_s = (end - begin)[of_track]
     cut = np.minimum((time_s - begin[of_track]) / track_s, 1 - 1e-9) * np.ceil(track_s / PIECE_S)
     piece = np.unique(np.stack([of_track, cut.astype(np.int64)]), axis=1, return_inverse=True)[1].ravel()
-    enough = (np.bincount(piece, ~is_other) >= _FEWEST[0]) & (np.bincount(piece, is_other) >= _FEWEST[1])
-    enough &= np.bincount(piece) >= _FEWEST[2]
-    if not enough.any():
+    is_long = (np.bincount(piece, ~is_other) >= _FEWEST[0]) & (np.bincount(piece, is_other) >= _FEWEST[1])
+    is_long &= np.bincount(piece) >= _FEWEST[2]
+    if not is_long.any():
         return None
-    time_s, of_track, place, is_other, piece = _keep_pieces(enough, time_s, of_track, place, is_other, piece)
+    time_s, of_track, place, is_other, piece = _keep_pieces(is_long, time_s, of_track, place, is_other, piece)
     low_s, high_s = _piece_spans(time_s, piece, len(np.unique(piece)))
     step = _piece_displacements(time_s, place, piece, low_s, high_s)
     moved_m = np.hypot(*step)
-    enough = moved_m > faster_mps * (high_s - low_s)
-    if not enough.any():
+    is_long = moved_m > faster_mps * (high_s - low_s)
+    if not is_long.any():
         return None
-    time_s, of_track, place, is_other, piece = _keep_pieces(enough, time_s, of_track, place, is_other, piece)
-    low_s, high_s, heading = low_s[enough], high_s[enough], (step / moved_m)[:, enough]
+    time_s, of_track, place, is_other, piece = _keep_pieces(is_long, time_s, of_track, place, is_other, piece)
+    low_s, high_s, heading = low_s[is_long], high_s[is_long], (step / moved_m)[:, is_long]
     place = place - np.stack([np.bincount(piece, values) for values in place])[:, piece] / np.bincount(piece)[piece]
     cos, sin = heading[:, piece]
     along_m, across_m = cos * place[0] + sin * place[1], cos * place[1] - sin * place[0]
@@ -374,8 +374,8 @@ def _match_tracks(tracks: ShortTracks, other: ListPoints, offset_s: float) -> tu
         if count[k] >= max(NEARLY * (during[1] - during[0]), min(_MATCHES, end[k] - begin[k])):
             rows.append(np.arange(begin[k], end[k]))
             matched.append(np.full(end[k] - begin[k], pair[0, k]))
-    none = np.empty(0, dtype=np.int64)
-    return np.concatenate([none, *rows]), np.concatenate([none, *matched])
+    empty = np.empty(0, dtype=np.int64)
+    return np.concatenate([empty, *rows]), np.concatenate([empty, *matched])
 
 
 def _state_estimate(fit: _Fit, *, unbiased: bool = False) -> TimeOffset:
@@ -435,18 +435,18 @@ class _Fit:
         return find_half_width(self._score, self._information, k, self._beyond) * float(self.ways.stretch)
 
 
-def find_half_width(score: Float, information: Float, k: int, beyond: float = 1.0) -> float:
+def find_half_width(score: Float, information: Float, k: int, factor: float = 1.0) -> float:
     """Half of the 95 % interval of coefficient `k`, from scores (G, C) and information (G, C, C) of G blocks.
 
     Where blocks move the coefficient by more than independent errors of entries would, the interval is wider in
-    proportion (Birge's ratio, times `beyond`). It is never narrower than independent errors make it.
+    proportion (Birge's ratio, times `factor`). It is never narrower than independent errors make it.
     """
     from scipy.special import stdtrit  # of Student's t; scipy.stats takes long to import
 
     inverse = np.linalg.pinv(information.sum(axis=0))[k]
     moved, variance = score @ inverse, np.einsum("c,gcd,d->g", inverse, information, inverse)
     freedom = max(len(score) - len(inverse), 1)
-    ratio = beyond * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
+    ratio = factor * (moved**2 / np.maximum(variance, 1e-12 * variance.sum())).sum() / freedom
     return float(stdtrit(freedom, 0.975) * np.sqrt(max(ratio, 1.0) * variance.sum()))
 
 

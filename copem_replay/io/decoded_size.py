@@ -1,4 +1,4 @@
-"""How much memory messages may take once they are decoded: told from their bytes before anything parses them.
+"""How much memory messages take once they are decoded, estimated from their bytes before anything parses them.
 
 A parser makes up to hundreds of bytes of two: an empty object is two bytes in protobuf and three in JSON, and sixty
 million of them compress to less than a megabyte. So what a message takes is estimated first, from above, with one pass

@@ -203,21 +203,21 @@ def find(rule: str, count: int, *, noun: str = "", **words: Any) -> Iterator[Fin
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def sift_states(values: Float, kept: Bool, findings: list[str]) -> tuple[Float, Bool]:
-    """States (P, V) with NaN for every number that is none, and which of those `kept` so far can be used.
+def sift_states(values: Float, was_usable: Bool, findings: list[str]) -> tuple[Float, Bool]:
+    """States (P, V) with NaN for every number that is none, and which of those `was_usable` so far can be used.
 
     A state needs a position and a yaw; what no state of all has, the format lacks: 0 then.
     """
-    none = ~(np.abs(values) <= _MOST)
-    if not none.any():
-        return values, kept
+    not_number = ~(np.abs(values) <= _MOST)
+    if not not_number.any():
+        return values, was_usable
     far = (np.abs(values[:, : Z + 1]) > FARTHEST_M).any(axis=1) & np.isfinite(values[:, : Z + 1]).all(axis=1)
-    values = np.where(none, np.nan, values)
+    values = np.where(not_number, np.nan, values)
     for column, rule in ((Z, "no z"), (YAW, "no yaw")):
-        if kept.any() and np.isnan(values[kept, column]).all():
+        if was_usable.any() and np.isnan(values[was_usable, column]).all():
             values[:, column] = 0.0
-            findings += find(rule, int(kept.sum()))
-    usable = kept.copy()
+            findings += find(rule, int(was_usable.sum()))
+    usable = was_usable.copy()
     nowhere = np.isnan(values[:, : Z + 1]).any(axis=1)
     for rule, rows in (("position", nowhere & ~far), ("far", far), ("yaw", np.isnan(values[:, YAW]))):
         findings += find(rule, int((usable & rows).sum()))
@@ -257,17 +257,17 @@ def complete_sizes(values: Float, class_ix: NDArray[Any], object_ix: Int | None,
         return values
     sizes = np.abs(sizes)
     findings += find("size negative", int((values[:, LENGTH:] < 0).any(axis=1).sum()))
-    good = (sizes > 0) & (sizes <= LONGEST_M)
+    plausible = (sizes > 0) & (sizes <= LONGEST_M)
     if object_ix is not None:
-        good[:, 2] |= sizes[:, 2] == 0.0  # a height of 0 is told of with those that are implausible
-    filled = np.where(good, sizes, np.nan)
-    if object_ix is not None and not good.all():
-        for number in np.unique(object_ix[~good.all(axis=1)]):
+        plausible[:, 2] |= sizes[:, 2] == 0.0  # a height of 0 is told of with those that are implausible
+    filled = np.where(plausible, sizes, np.nan)
+    if object_ix is not None and not plausible.all():
+        for number in np.unique(object_ix[~plausible.all(axis=1)]):
             rows = np.flatnonzero(object_ix == number)
-            own = good[rows]
+            own = plausible[rows]
             for column in np.flatnonzero(own.any(axis=0) & ~own.all(axis=0)):
                 filled[rows[~own[:, column]], column] = np.median(sizes[rows[own[:, column]], column])
-    findings += find("size lost", int((~good & ~np.isnan(filled)).any(axis=1).sum()))
+    findings += find("size lost", int((~plausible & ~np.isnan(filled)).any(axis=1).sum()))
     unknown = np.isnan(filled)
     if object_ix is not None:
         filled[unknown[:, 2], 2] = 0.0

@@ -114,11 +114,11 @@ class FrameTree:
         for child in dict.fromkeys(poses.child):
             if not child or child in self.pose_tracks:
                 continue
-            chosen = np.asarray(children == child)
+            of_child = np.asarray(children == child)
             if static:  # as in tf2 the last one that was sent holds
-                rows = np.flatnonzero(chosen)
-                chosen = np.arange(len(chosen)) == rows[np.argsort(poses.log_time_ns[rows], kind="stable")[-1]]
-            course = make_pose_track(poses, chosen, self.max_gap_s)
+                rows = np.flatnonzero(of_child)
+                of_child = np.arange(len(of_child)) == rows[np.argsort(poses.log_time_ns[rows], kind="stable")[-1]]
+            course = make_pose_track(poses, of_child, self.max_gap_s)
             if course is not None and course.parent != child:
                 self.pose_tracks[child] = course
                 if static:
@@ -143,12 +143,12 @@ class FrameTree:
         common = next((name for name in up if name in down), None)
         if common is None:
             return None
-        own, other = (self._climb(chain[: chain.index(common)], stamp_ns) for chain in (up, down))
-        turn = invert_rotation(other.rotation)
+        placed, base = (self._climb(chain[: chain.index(common)], stamp_ns) for chain in (up, down))
+        turn = invert_rotation(base.rotation)
         return SampledPoses(
-            own.there & other.there,
-            rotate_vectors(turn, own.position_m - other.position_m),
-            compose_rotations(turn, own.rotation),
+            placed.there & base.there,
+            rotate_vectors(turn, placed.position_m - base.position_m),
+            compose_rotations(turn, placed.rotation),
         )
 
     def place_by_ego(self, frame: str, ego: PoseTrack, stamp_ns: Int) -> SampledPoses | None:
@@ -190,31 +190,31 @@ NOMINAL_M = (4.5, 1.8, 1.5)
 _SHOWN = 12  # frames named in an error, at most
 
 
-def ego_channel(log: Log, channels: Sequence[Channel], asked: EgoTopic | None, seek_ego: bool) -> Channel | None:
-    """The channel of the ego's poses: the one `asked` for, else, with `seek_ego`, the only odometry; None: no ego.
+def ego_channel(log: Log, channels: Sequence[Channel], spec: EgoTopic | None, seek_ego: bool) -> Channel | None:
+    """The channel of the ego's poses: the one `spec` for, else, with `seek_ego`, the only odometry; None: no ego.
 
     Raises EgoError: the topic that is asked for has no poses.
     """
-    if asked is not None:
-        on_topic = [c for c in channels if c.topic == asked.topic]
+    if spec is not None:
+        on_topic = [c for c in channels if c.topic == spec.topic]
         if not on_topic:
             topics = ", ".join(f"{c.topic} ({c.schema})" for c in channels) or "none"
-            raise EgoError(f"no poses on topic {asked.topic!r}; poses are on: {topics}", path=log.path)
+            raise EgoError(f"no poses on topic {spec.topic!r}; poses are on: {topics}", path=log.path)
         return on_topic[0]
     odometry = [c for c in channels if schema_name(c) == ODOMETRY]
     return odometry[0] if seek_ego and len(odometry) == 1 else None
 
 
-def ego_course(log: Log, topic: str, poses: Poses, asked: EgoTopic | None, max_gap_s: float) -> PoseTrack:
+def ego_course(log: Log, topic: str, poses: Poses, spec: EgoTopic | None, max_gap_s: float) -> PoseTrack:
     """The ego's poses, of the frame that is asked for. Raises EgoError: no pose, or poses of several frames."""
-    child = asked.frame if asked is not None else None
-    picked = None if child is None else np.array([name == child.lstrip("/") for name in poses.child], dtype=bool)
+    child = spec.frame if spec is not None else None
+    of_child = None if child is None else np.array([name == child.lstrip("/") for name in poses.child], dtype=bool)
     children = sorted(set(poses.child))
-    if picked is None and len(children) > 1:
+    if of_child is None and len(children) > 1:
         raise EgoError(
             f"{topic} has poses of several frames; choose with `frame`: {', '.join(children[:_SHOWN])}", path=log.path
         )
-    course = make_pose_track(poses, picked, max_gap_s)
+    course = make_pose_track(poses, of_child, max_gap_s)
     if course is None:
         of = f" of frame {child!r}" if child else ""
         raise EgoError(f"no pose on topic {topic!r}{of}{window_hint(log)}", path=log.path)
@@ -226,16 +226,16 @@ def window_hint(log: Log) -> str:
     return "" if log.window is None else " in the window"
 
 
-def ego_notes(chosen: Channel, asked: EgoTopic | None) -> Iterator[str]:
+def ego_notes(channel: Channel, spec: EgoTopic | None) -> Iterator[str]:
     """A line for everything that is assumed of the ego."""
-    if asked is None:
-        yield f"the ego is where {chosen.topic} ({chosen.schema}) says"
-    if asked is None or asked.centre_from_rear_axle_m is None:
+    if spec is None:
+        yield f"the ego is where {channel.topic} ({channel.schema}) says"
+    if spec is None or spec.centre_from_rear_axle_m is None:
         yield (
             "ego: its poses are taken for the centre of its box; they are often those of the rear axle: "
-            f"`ego: {{topic: {chosen.topic}, centre_from_rear_axle_m: …}}`"
+            f"`ego: {{topic: {channel.topic}, centre_from_rear_axle_m: …}}`"
         )
-    if asked is None or asked.size_m is None:
+    if spec is None or spec.size_m is None:
         size = " × ".join(f"{side:g}" for side in NOMINAL_M)
         yield f"ego: no size is said (`size_m: [length, width, height]`): {size} m taken to hide others, gaps are null"
 
@@ -250,11 +250,11 @@ def find_listed_ego(columns: DecodedObjects, course: PoseTrack) -> int | None:
     message = np.repeat(np.arange(len(columns.rows)), columns.rows)
     away_m = np.hypot(*(columns.values[:, k] - placed.position_m[message, k] for k in range(2)))
     driven = columns.class_ix != CLASSES.index("pedestrian")
-    of, near = (
+    listed, near = (
         np.bincount(columns.object_ix[rows], minlength=len(columns.object_ids))
         for rows in (placed.there[message], placed.there[message] & (away_m < _SAME_BODY_M) & driven)
     )
-    found = np.flatnonzero((near > _ALWAYS * of) & (of > _ALWAYS * placed.there.sum()) & columns.moving)
+    found = np.flatnonzero((near > _ALWAYS * listed) & (listed > _ALWAYS * placed.there.sum()) & columns.moving)
     return int(found[0]) if len(found) == 1 else None
 
 
@@ -262,7 +262,7 @@ _ALWAYS = 0.9  # share of the lists in which the ego is where its poses are
 
 
 def add_ego(
-    columns: DecodedObjects, course: PoseTrack | None, asked: EgoTopic | None, topic: str = ""
+    columns: DecodedObjects, course: PoseTrack | None, spec: EgoTopic | None, topic: str = ""
 ) -> DecodedObjects:
     """The columns with the ego added to every list at whose instant it has a pose; unchanged without a course.
 
@@ -274,8 +274,8 @@ def add_ego(
         name = columns.object_ids[listed]
         return replace(columns, hosts=(name,), notes=(*columns.notes, *find("ego listed", 1, id=name, topic=topic)))
     placed = course.at(columns.stamp_ns)
-    length, width, height = asked.size_m if asked is not None and asked.size_m is not None else NOMINAL_M
-    ahead = (asked.centre_from_rear_axle_m if asked is not None else None) or 0.0
+    length, width, height = spec.size_m if spec is not None and spec.size_m is not None else NOMINAL_M
+    ahead = (spec.centre_from_rear_axle_m if spec is not None else None) or 0.0
     centre = placed.position_m + rotate_vectors(placed.rotation, np.array([ahead, 0.0, height / 2]))
     yaw = yaw_of(placed.rotation)
     rows = np.full((len(yaw), len(VALUES)), np.nan)
@@ -325,8 +325,8 @@ class LogContext:
         return self.ego.parent if self.ego is not None else self.frames.world_of(frame)
 
 
-def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool, max_gap_s: float = MAX_GAP_S) -> LogContext:
-    """The frames and the ego of a recording; `seek_ego`: the only odometry is the ego's, if nothing is `asked`.
+def read_log_context(log: Log, spec: EgoTopic | None, *, seek_ego: bool, max_gap_s: float = MAX_GAP_S) -> LogContext:
+    """The frames and the ego of a recording; `seek_ego`: the only odometry is the ego's, if nothing is `spec`.
 
     Raises RecordingError: no such topic; BrokenIndexError.
     """
@@ -356,33 +356,33 @@ def read_log_context(log: Log, asked: EgoTopic | None, *, seek_ego: bool, max_ga
         if channel.number in of_channel:
             of_channel[channel.number] = _rename_frames(of_channel[channel.number], channel.part, own)
             frames.add(of_channel[channel.number], static=is_static(channel))
-    chosen = ego_channel(log, channels, asked, seek_ego)
+    ego_poses = ego_channel(log, channels, spec, seek_ego)
     empty = [c.topic for c in log.channels if is_pose(c) and is_static(c) and not c.messages]
     missing = f"; {empty[0]} is empty: of a split bag the first part alone has it, so give the folder" if empty else ""
-    if chosen is None:
-        return LogContext(frames, None, asked, tuple(notes), own, static_missing=missing)
-    if not messages.payloads[chosen.number]:
-        raise EgoError(f"no pose on topic {chosen.topic!r}{window_hint(log)}", path=log.path)
-    if chosen.number not in of_channel:  # not decoded, which a note tells
-        return LogContext(frames, None, asked, tuple(notes), own)
-    if asked is not None and asked.frame is not None:
-        asked = asked.model_copy(update={"frame": own.get((chosen.part, asked.frame.lstrip("/")), asked.frame)})
-    course = ego_course(log, chosen.topic, of_channel[chosen.number], asked, max_gap_s)
-    return LogContext(frames, course, asked, (*notes, *ego_notes(chosen, asked)), own, chosen.topic, missing)
+    if ego_poses is None:
+        return LogContext(frames, None, spec, tuple(notes), own, static_missing=missing)
+    if not messages.payloads[ego_poses.number]:
+        raise EgoError(f"no pose on topic {ego_poses.topic!r}{window_hint(log)}", path=log.path)
+    if ego_poses.number not in of_channel:  # not decoded, which a note tells
+        return LogContext(frames, None, spec, tuple(notes), own)
+    if spec is not None and spec.frame is not None:
+        spec = spec.model_copy(update={"frame": own.get((ego_poses.part, spec.frame.lstrip("/")), spec.frame)})
+    course = ego_course(log, ego_poses.topic, of_channel[ego_poses.number], spec, max_gap_s)
+    return LogContext(frames, course, spec, (*notes, *ego_notes(ego_poses, spec)), own, ego_poses.topic, missing)
 
 
 def _keep_run(poses: Poses, window: Window | None) -> Poses:
     """The poses without those of another run than that of the window: its margin reaches into the one before."""
     if window is None:
         return poses
-    kept, frames = np.ones(len(poses.stamp_ns), dtype=bool), np.array(poses.child, dtype=object)
+    same_run, frames = np.ones(len(poses.stamp_ns), dtype=bool), np.array(poses.child, dtype=object)
     for child in set(poses.child):
         rows = np.flatnonzero(frames == child)
         run = find_runs(poses.stamp_ns[rows], poses.log_time_ns[rows])
         inside = [window.from_ns <= logged_ns <= window.to_ns for logged_ns in poses.log_time_ns[rows].tolist()]
         if any(inside):
-            kept[rows] = np.isin(run, run[inside])
-    return poses if kept.all() else poses.take(np.flatnonzero(kept))
+            same_run[rows] = np.isin(run, run[inside])
+    return poses if same_run.all() else poses.take(np.flatnonzero(same_run))
 
 
 def _strip_slashes(poses: Poses) -> Poses:
@@ -408,12 +408,12 @@ def _rename_frames(poses: Poses, part: str, own: Mapping[tuple[str, str], str]) 
 
 def _add_classes(description: Description, classes: Mapping[str, str]) -> Description:
     """The description with classes of further names."""
-    of = description.fields.class_
-    if not classes or of is None:
+    class_field = description.fields.class_
+    if not classes or class_field is None:
         return description
-    of = ClassField(path=of) if isinstance(of, str) else of
-    of = of.model_copy(update={"map": {**of.map, **classes}})
-    return replace(description, fields=description.fields.model_copy(update={"class_": of}))
+    class_field = ClassField(path=class_field) if isinstance(class_field, str) else class_field
+    class_field = class_field.model_copy(update={"map": {**class_field.map, **classes}})
+    return replace(description, fields=description.fields.model_copy(update={"class_": class_field}))
 
 
 def read_decoded_lists(
@@ -447,37 +447,37 @@ def transform_rows(values: Float, covariance: Float, placed: SampledPoses, insta
     vx, vy = values[:, VX].copy(), values[:, VY].copy()
     values[:, VX], values[:, VY] = cos * vx - sin * vy, sin * vx + cos * vy
     xx, xy, yy = covariance.T
-    turned = [
+    rotated = [
         cos * cos * xx - 2 * cos * sin * xy + sin * sin * yy,
         cos * sin * (xx - yy) + (cos * cos - sin * sin) * xy,
         sin * sin * xx + 2 * cos * sin * xy + cos * cos * yy,
     ]
-    return values, np.stack(turned, axis=1)
+    return values, np.stack(rotated, axis=1)
 
 
-def _name_frames(lists: DecodedLists, around: LogContext) -> DecodedLists:
+def _name_frames(lists: DecodedLists, context: LogContext) -> DecodedLists:
     """The lists with entries of no named frame as of that which the others name, else of the ego's world."""
     nameless = np.array([not name.strip("/") for name in lists.frames] + [True])[lists.frame_code]
-    if not nameless.any() or (around.ego is None and nameless.all()):
+    if not nameless.any() or (context.ego is None and nameless.all()):
         return lists
     named = lists.frame_code[~nameless]
     code = int(np.bincount(named).argmax()) if len(named) else len(lists.frames)
-    frames = lists.frames if len(named) or around.ego is None else (*lists.frames, around.ego.parent)
+    frames = lists.frames if len(named) or context.ego is None else (*lists.frames, context.ego.parent)
     findings = find("frameless", int(nameless.sum()), frame=frames[code])
     columns = replace(lists.columns, notes=(*lists.columns.notes, *findings))
     return replace(lists, columns=columns, frames=frames, frame_code=np.where(nameless, code, lists.frame_code))
 
 
-def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topic: str) -> DecodedLists:
+def transform_to_world(lists: DecodedLists, context: LogContext, path: Path, topic: str) -> DecodedLists:
     """The lists in the world, without the states at instants at which their frame has no place; notes tell of both.
 
     Raises RecordingError, naming `path` and `topic`: no transforms connect a list's frame with the world.
     """
-    lists = _name_frames(lists, around)
-    names = around.named(lists)
+    lists = _name_frames(lists, context)
+    names = context.named(lists)
     if not len(lists.frame_code) or not names:
         return lists
-    world = around.world_of(lists)
+    world = context.world_of(lists)
     message = np.repeat(np.arange(len(lists.columns.stamp_ns)), lists.columns.rows)
     values, covariance = lists.columns.values.copy(), lists.covariance_m2.copy()
     has_place = np.ones(len(values), dtype=bool)
@@ -487,11 +487,11 @@ def transform_to_world(lists: DecodedLists, around: LogContext, path: Path, topi
         if not len(rows) or name in (world, "") or not world:
             continue
         stamps, instant = np.unique(lists.columns.stamp_ns[message[rows]], return_inverse=True)
-        placed = around.frames.place(name, world, stamps)
+        placed = context.frames.place(name, world, stamps)
         if placed is None:
             raise RecordingError(
                 f"lists are in the frame {name!r}, the ego in {world!r}, and no transform of the recording "
-                f"says how they lie{around.static_missing}",
+                f"says how they lie{context.static_missing}",
                 path=path,
                 topic=topic,
             )

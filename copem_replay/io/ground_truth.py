@@ -69,17 +69,17 @@ class DecodedObjects:
     notes: tuple[str, ...] = ()  # a line for each kind of state that was skipped or completed
 
 
-def take_messages(columns: DecodedObjects, kept: Bool) -> DecodedObjects:
-    """The lists of the messages `kept` (F,)."""
-    if kept.all():
+def take_messages(columns: DecodedObjects, keep: Bool) -> DecodedObjects:
+    """The lists of the messages in the mask `keep` (F,)."""
+    if keep.all():
         return columns
-    rows = np.repeat(kept, columns.rows)
-    of_message = {name: getattr(columns, name)[kept] for name in ("stamp_ns", "stamped", "log_time_ns", "rows")}
+    rows = np.repeat(keep, columns.rows)
+    of_message = {name: getattr(columns, name)[keep] for name in ("stamp_ns", "stamped", "log_time_ns", "rows")}
     return replace(columns, **of_message, **{n: getattr(columns, n)[rows] for n in ("object_ix", "class_ix", "values")})
 
 
 def list_contents(columns: DecodedObjects) -> list[bytes]:
-    """What each message (F,) says of its objects, as bytes: equal for equal lists."""
+    """The content of each message (F,) as bytes: equal for equal lists."""
     ends = np.cumsum(columns.rows).tolist()
     spans = [slice(end - number, end) for end, number in zip(ends, columns.rows.tolist(), strict=True)]
     return [columns.object_ix[rows].tobytes() + columns.values[rows].tobytes() for rows in spans]
@@ -264,11 +264,11 @@ def _order_messages(columns: DecodedObjects, notes: list[str]) -> tuple[Int, Int
     """(F,) indices of the messages that are kept, in order of time, and (F,) their stamps."""
     stamp_ns = columns.stamp_ns
     notes += find("late", int((np.diff(stamp_ns) < 0).sum()))
-    kept = np.argsort(stamp_ns, kind="stable")
-    again = np.diff(stamp_ns[kept], prepend=stamp_ns[kept[:1]] - SAME_INSTANT_NS) < SAME_INSTANT_NS
-    notes += find("again", int(again.sum()))
-    kept = kept[~again]
-    return kept, stamp_ns[kept]
+    order = np.argsort(stamp_ns, kind="stable")
+    repeated = np.diff(stamp_ns[order], prepend=stamp_ns[order[:1]] - SAME_INSTANT_NS) < SAME_INSTANT_NS
+    notes += find("again", int(repeated.sum()))
+    order = order[~repeated]
+    return order, stamp_ns[order]
 
 
 def _drop_repeated_objects(row: Int, frame: Int, object_ix: Int, notes: list[str]) -> Int:

@@ -59,7 +59,7 @@ def check_magic(path: Path, file: IO[bytes]) -> None:
 
 
 def unpacking_advice(path: Path) -> str | None:
-    """What to do with a file that is compressed as a whole, None for one that is not, by its name."""
+    """Advice on a file that is compressed as a whole, by its name; None: it is not."""
     program = _UNPACKED_BY.get(path.suffix.lower())
     return f"compressed as a whole, which is not read; unpack it first: {program} -d {path.name}" if program else None
 
@@ -173,7 +173,7 @@ class Log:
             yield from sorted(messages, key=_log_time) if sort and not self.indexed else messages
 
     def attempt(self, read: Callable[[Log], Result]) -> Result:
-        """What `read` gives of the log, opened without indexes that turn out to be broken. Raises RecordingError."""
+        """The result of `read` with the log, opened without indexes that prove to be broken. Raises RecordingError."""
         log = self
         while True:  # of several files each may have one
             try:

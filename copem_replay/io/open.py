@@ -121,25 +121,25 @@ Stamps = tuple[FileStamp, ...]
 """The stamps of all files of a recording."""
 
 
-def sha256_of(at: Local) -> str:
+def sha256_of(recording: Local) -> str:
     """SHA-256 of a file; of a rosbag2 folder, or of several recordings, that of their files concatenated, as by `cat`.
 
     Raises RecordingError: a file cannot be read, or a folder is none of rosbag2.
     """
     digest = hashlib.sha256()
-    for path in _list_paths(at):
+    for path in _list_paths(recording):
         for place in list_bag_files(path) if path.is_dir() else [path]:
             with open_file(place) as file:
                 hashlib.file_digest(file, lambda: digest)  # type: ignore[arg-type]  # it has `readinto`
     return digest.hexdigest()
 
 
-def read_file_stamps(at: Local) -> Stamps:
+def read_file_stamps(recording: Local) -> Stamps:
     """The stamps of a recording's files, taken without reading them.
 
     Raises RecordingError: a file is not there, or the folder is none of rosbag2.
     """
-    return tuple(FileStamp.of(file) for path in _list_paths(at) for file in _list_files(path))
+    return tuple(FileStamp.of(file) for path in _list_paths(recording) for file in _list_files(path))
 
 
 def check_files_unchanged(stamps: Stamps) -> None:
@@ -268,8 +268,8 @@ def label_files(paths: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-deep:]) for path in bare]
 
 
-def _windows_overlap(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    return one[0] <= other[1] and other[0] <= one[1]
+def _windows_overlap(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    return first[0] <= second[1] and second[0] <= first[1]
 
 
 def _shift_window(window: Window | None, ahead_ns: int) -> Window | None:

@@ -108,7 +108,7 @@ def _settle_times(rows: _EntryRows, findings: list[str]) -> _ListTimes:
         said = np.array([stamp is not None for stamp in stated], dtype=bool)
         moved_ns = np.array([log if stamp is None else stamp for stamp, log in zip(stated, rows.logged, strict=True)])
         moved_ns = moved_ns.astype(np.int64) - np.where(said, ahead_ns, 0)
-        stamp_ns, known, _, found = settle_stamps(moved_ns, said, logged_ns, ahead_ns=ahead_ns, told=rows.impossible)
+        stamp_ns, known, _, found = settle_stamps(moved_ns, said, logged_ns, ahead_ns=ahead_ns, noted=rows.impossible)
         findings += [] if settled else found  # a capture that is not set is that of the stamp
         settled.append((stamp_ns, known))
     (arrives_ns, stamped), (captured_ns, capture_said) = settled
@@ -236,15 +236,15 @@ def _no_lists_message(log: Log, topic: str) -> str:
 
 def _read_messages(log: Log, topic: str) -> _EntryRows:
     """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
-    chosen = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
-    if not chosen:
+    list_channels = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
+    if not list_channels:
         raise RecordingError(_no_lists_message(log, topic), path=log.path)
     detail_topic = f"{topic.removesuffix('/objects')}/detail"
-    beside = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
+    detail_channels = {c.number for c in log.channels if c.topic == detail_topic and c.schema == DETAIL_SCHEMA}
     rows, allowance = _EntryRows(), DecodeAllowance(log.file_bytes())
     details: dict[int, list[Any]] = {}
-    for number, log_time_ns, payload in log.payloads(frozenset({*chosen, *beside})):
-        if number in beside:
+    for number, log_time_ns, payload in log.payloads(frozenset({*list_channels, *detail_channels})):
+        if number in detail_channels:
             with suppress(ValueError, TypeError, KeyError):  # else not written by `copem-replay`
                 content = parse_json(payload)
                 details[content["available_ns"]] = [*content["objects"]]
@@ -260,7 +260,7 @@ def _read_messages(log: Log, topic: str) -> _EntryRows:
             except DecodeError:
                 rows.undecoded += 1
                 continue
-            _add_message(rows, message, log_time_ns, chosen[number].ahead_ns)
+            _add_message(rows, message, log_time_ns, list_channels[number].ahead_ns)
     if rows.undecoded and not rows.logged:
         raise RecordingError(f"none of its {rows.undecoded} messages can be decoded", path=log.path, topic=topic)
     rows.add_details(details)
@@ -291,10 +291,10 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
         rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
         stated = [(spread.orientation, "yaw"), (spread.dimension, "length")]
         stated += [(spread.velocity, "x")] if speed is not None else []
-        beside = [getattr(of, name) if of.HasField(name) else np.nan for of, name in stated]
-        beside += [0.0] if speed is None else []
-        said = spread.position.HasField("x") and spread.position.HasField("y")
-        along, across = (each * each if said else 0.0 for each in (spread.position.x, spread.position.y))
+        deviations = [getattr(of, name) if of.HasField(name) else np.nan for of, name in stated]
+        deviations += [0.0] if speed is None else []
+        has_spread = spread.position.HasField("x") and spread.position.HasField("y")
+        along, across = (each * each if has_spread else 0.0 for each in (spread.position.x, spread.position.y))
         turn = _frame_yaw(message)
         cos, sin = np.cos(turn), np.sin(turn)
         rows.variances.append(
@@ -302,7 +302,7 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
                 float(cos * cos * along + sin * sin * across),
                 float(cos * sin * (along - across)),
                 float(sin * sin * along + cos * cos * across),
-                *(s * s for s in beside),
+                *(s * s for s in deviations),
             )
         )
         header = item.header
@@ -313,7 +313,7 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
 
 def _class_probabilities(item: Any, rows: _EntryRows) -> dict[int, float]:
     """Probability by index of class, as the unit states it for a moving object; empty for a stationary one."""
-    likely: dict[int, float] = {}
+    probability: dict[int, float] = {}
     for candidate in getattr(item, "candidate", ()):
         if not hasattr(candidate, "vehicle_classification"):  # a stationary object's
             continue
@@ -328,8 +328,8 @@ def _class_probabilities(item: Any, rows: _EntryRows) -> dict[int, float]:
         if not 0.0 <= share <= MOST_SHARE:
             rows.rules["class share"] += 1
             share = 0.0
-        likely[kind] = likely.get(kind, 0.0) + share
-    return likely
+        probability[kind] = probability.get(kind, 0.0) + share
+    return probability
 
 
 def _frame_yaw(message: Any) -> float:
@@ -413,29 +413,29 @@ def read_unit_lists(
 
 @np.errstate(over="ignore", invalid="ignore")
 def read_described_lists(
-    path: Local, topic: str, scene: Scene, around: LogContext | None, window: Window | None = None
+    path: Local, topic: str, scene: Scene, context: LogContext | None, window: Window | None = None
 ) -> RecordedLists | None:
     """The lists on `topic` of a format other than OSI's, in the world of the truth; None: the topic has none.
 
     Raises RecordingError.
     """
-    return open_log(path).within(window).attempt(lambda log: _read_described(log, topic, scene, around))
+    return open_log(path).within(window).attempt(lambda log: _read_described(log, topic, scene, context))
 
 
-def _read_described(log: Log, topic: str, scene: Scene, around: LogContext | None) -> RecordedLists | None:
+def _read_described(log: Log, topic: str, scene: Scene, context: LogContext | None) -> RecordedLists | None:
     channels = [c for c in known_lists(log.channels) if c.topic == topic]
     if not channels:
         return None
     same_schema = [c for c in channels if c.schema == channels[0].schema]
     if log.window is not None and next(log.payloads(frozenset(c.number for c in same_schema)), None) is None:
         raise RecordingError("holds no list in the window", path=log.path, topic=topic)
-    around = around or read_log_context(log, None, seek_ego=False)
-    lists = read_decoded_lists(log, same_schema, None, around.classes)
+    context = context or read_log_context(log, None, seek_ego=False)
+    lists = read_decoded_lists(log, same_schema, None, context.classes)
     if lists.station is not None:
         lists = place_on_earth(lists, lists.station, scene.frame, log.path, topic)
         lists, captures = settle_measurements(lists, scene.t0_ns, log.path, topic)
         return _make_recorded_lists(lists, captures, {}, log.path, topic, scene)
-    lists, details = transform_to_world(lists, around, log.path, topic), _read_details(log, topic)
+    lists, details = transform_to_world(lists, context, log.path, topic), _read_details(log, topic)
     captures = _find_captures(lists.columns.stamp_ns, details)
     return _make_recorded_lists(lists, captures, details, log.path, topic, scene)
 
@@ -462,12 +462,12 @@ def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
 
 def _find_captures(stamps: Int, details: Details) -> tuple[Int, Bool]:
     """(F,) captures of the lists available at `stamps`, and whether `details` state them; else the stamp itself."""
-    captured, stated = stamps.copy(), np.zeros(len(stamps), dtype=bool)
+    captured, is_stated = stamps.copy(), np.zeros(len(stamps), dtype=bool)
     for k, stamp in enumerate(stamps.tolist()):
         captured_ns = details.get(stamp, {}).get("captured_ns")
         if isinstance(captured_ns, int) and abs(captured_ns) <= LAST_NS:
-            captured[k], stated[k] = captured_ns, True
-    return captured, stated
+            captured[k], is_stated[k] = captured_ns, True
+    return captured, is_stated
 
 
 def _add_details(lists: DecodedLists, details: Details) -> tuple[DecodedLists, Float]:

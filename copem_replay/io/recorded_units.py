@@ -46,12 +46,12 @@ def estimate_delay(recorded: RecordedLists, scene: Scene, truth: Tracks) -> Time
 
     Entries are taken as shifted along their path wherever such a shift can be told from a delay.
     """
-    unsaid = ~recorded.capture_said[recorded.tracks.frame_ix]
+    unstated = ~recorded.capture_said[recorded.tracks.frame_ix]
     lists = make_list_points(recorded.tracks, scene.t0_ns, recorded.track_id)
     order = np.argsort(
         np.unique(recorded.tracks.stamp_ns, return_inverse=True)[1][recorded.tracks.frame_ix], kind="stable"
     )
-    lists = lists.take(np.flatnonzero(unsaid[order]))
+    lists = lists.take(np.flatnonzero(unstated[order]))
     return estimate_time_offset(
         make_list_points(truth, scene.t0_ns), lists, from_s=EARLIEST_S, to_s=LONGEST_S, shifted=True
     )
@@ -176,29 +176,29 @@ def read_as_recorded(recording: Recording, topic: str) -> RecordedLists:
 def read_recorded_unit(
     recording: Recording,
     name: str,
-    asked: RecordedTopic,
+    config: RecordedTopic,
     *,
     gate_m: float = 3.0,
     max_gap_s: float = MAX_GAP_S,
-    called: str = "unit",
-    held: bool = True,
+    noun: str = "unit",
+    checked: bool = True,
 ) -> tuple[RecordedLists, list[str]]:
     """A unit's lists as the experiment asks for them, in the window and frames of the truth, and notes.
 
-    `called`: what the notes call it. `held`: whether it is checked against the truth.
+    `noun`: what the notes call it. `checked`: whether it is checked against the truth.
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
     path, scene = recording.path, recording.scene
-    lists = read_as_recorded(recording, asked.topic)
+    lists = read_as_recorded(recording, config.topic)
     tracks = lists.tracks
     if not len(tracks.stamp_ns):
         raise RecordingError(
-            f"holds no list{' in the window' if recording.window else ''}", path=path, topic=asked.topic
+            f"holds no list{' in the window' if recording.window else ''}", path=path, topic=config.topic
         )
-    columns = _covariance_columns(lists, asked, path)
-    label = f"{called} {name}"
+    columns = _covariance_columns(lists, config, path)
+    label = f"{noun} {name}"
     notes = [note.within(label) if isinstance(note, Finding) else f"{label}: {note}" for note in lists.notes]
-    late_ns = np.where(lists.capture_said, 0, round(asked.delay_s * 1e9))
+    late_ns = np.where(lists.capture_said, 0, round(config.delay_s * 1e9))
     arrives_ns = scene.t0_ns + np.rint(tracks.common_arrives_s * 1e9).astype(np.int64)
     stamp_ns = np.minimum(tracks.stamp_ns - late_ns, arrives_ns)
     early = int((tracks.stamp_ns > arrives_ns + SAME_INSTANT_NS).sum())
@@ -208,41 +208,41 @@ def read_recorded_unit(
     tracks = replace(
         tracks, units=(name,), stamp_ns=stamp_ns, captured_s=(stamp_ns - scene.t0_ns) * np.float64(1e-9), **columns
     )
-    if held:
-        statement = f"delay_s is {asked.delay_s:g}"
+    if checked:
+        statement = f"delay_s is {config.delay_s:g}"
         lines = check_against_truth(
-            recording, lists, tracks, statement, asked.delay_s, gate_m=gate_m, max_gap_s=max_gap_s
+            recording, lists, tracks, statement, config.delay_s, gate_m=gate_m, max_gap_s=max_gap_s
         )
         notes += [f"{label}: {line}" for line in lines]
-    existence = np.where(np.isnan(lists.existence), asked.existence, lists.existence)
+    existence = np.where(np.isnan(lists.existence), config.existence, lists.existence)
     return replace(lists, tracks=tracks, existence=np.clip(existence, 0.0, 1.0)), notes
 
 
-def _covariance_columns(lists: RecordedLists, asked: RecordedTopic, path: Path) -> dict[str, Any]:
+def _covariance_columns(lists: RecordedLists, config: RecordedTopic, path: Path) -> dict[str, Any]:
     """The columns of covariance with that of the experiment where a list states none; empty: it gives none.
 
     Raises RecordingError: a list states none, and the experiment gives none.
     """
-    unsaid = ~lists.spread_said
-    if asked.covariance_m2 is None:
-        if unsaid.any():
+    unstated = ~lists.spread_said
+    if config.covariance_m2 is None:
+        if unstated.any():
             raise RecordingError(
-                f"{unsaid.sum()} of {count_noun(len(unsaid), 'entry', 'entries')} say nothing of their "
+                f"{unstated.sum()} of {count_noun(len(unstated), 'entry', 'entries')} say nothing of their "
                 "covariance; give `covariance_m2`, which `copem-replay fit` estimates",
                 path=path,
-                topic=asked.topic,
+                topic=config.topic,
             )
         return {}
-    (ee, en), (_, nn) = asked.covariance_m2
+    (ee, en), (_, nn) = config.covariance_m2
     values = (("cov_ee_m2", ee), ("cov_en_m2", en), ("cov_nn_m2", nn))
-    return {column: np.where(unsaid, value, getattr(lists.tracks, column)) for column, value in values}
+    return {column: np.where(unstated, value, getattr(lists.tracks, column)) for column, value in values}
 
 
 def check_against_truth(
     recording: Recording,
     lists: RecordedLists,
     tracks: Tracks,
-    said: str,
+    statement: str,
     delay_s: float,
     *,
     gate_m: float,
@@ -251,13 +251,13 @@ def check_against_truth(
     """A line for a delay that the truth contradicts, and a line for each oddity.
 
     `lists`: captured at their stamps. `tracks`: the same rows at the instants that the experiment states,
-    `delay_s` before the stamps; `said` words that statement.
+    `delay_s` before the stamps; `statement` words that statement.
     """
     scene, truth = recording.scene, recording.truth
     if not lists.capture_said.all():
         delay = estimate_delay(lists, scene, truth)
         if delay.untold is None and not delay.low_s <= delay_s <= delay.high_s:
-            yield f"{said}, but its entries fit the truth at {delay_words(delay)}"
+            yield f"{statement}, but its entries fit the truth at {delay_words(delay)}"
     matched = assign_truth_ids(replace(lists, tracks=tracks), scene, truth, gate_m=gate_m, max_gap_s=max_gap_s)
     yield from describe_oddities(lists, matched.row_object_ix, scene)
 
@@ -278,7 +278,7 @@ def assign_truth_ids(
     order, bounds = world.by_frame
     by_list, starts = tracks.by_frame
     object_ix = np.full(len(tracks.frame_ix), -1)
-    likely = lists.class_probability.argmax(axis=1)
+    class_ix = lists.class_probability.argmax(axis=1)
     for f in range(len(tracks.stamp_ns)):
         rows = by_list[starts[f] : starts[f + 1]]
         bodies = order[bounds[instant[f]] : bounds[instant[f] + 1]]
@@ -287,8 +287,8 @@ def assign_truth_ids(
         away_m = np.hypot(
             tracks.x_m[0, rows, None] - world.x_m[0, bodies], tracks.y_m[0, rows, None] - world.y_m[0, bodies]
         )
-        alike = AGREE[likely[rows][:, None], scene.object_class[world.row_object_ix[bodies]]]
-        allowed = (away_m <= gate_m + 1e-9) & (alike | (confused > 0))
+        agrees = AGREE[class_ix[rows][:, None], scene.object_class[world.row_object_ix[bodies]]]
+        allowed = (away_m <= gate_m + 1e-9) & (agrees | (confused > 0))
         for ego in np.flatnonzero(world.row_object_ix[bodies] == scene.ego_ix):
             body_m = np.where(allowed[:, ego] & _is_inside(tracks, rows, world, bodies[ego]), away_m[:, ego], np.inf)
             if np.isfinite(body_m.min()):
@@ -296,7 +296,7 @@ def assign_truth_ids(
                 allowed[body_m.argmin()] = False
             allowed[:, ego] = False
         partner = np.full(len(rows), -1)
-        worth = (away_m - (gate_m + 2e-9)) * np.where(alike, 1.0, confused)
+        worth = (away_m - (gate_m + 2e-9)) * np.where(agrees, 1.0, confused)
         assign(np.where(allowed, worth, np.inf), partner)
         object_ix[rows[partner >= 0]] = world.row_object_ix[bodies[partner[partner >= 0]]]
     return replace(tracks, object_ix=object_ix)
@@ -336,15 +336,15 @@ _PREDICTED = "by `tells_of` its states are of when it is available, a delay of 0
 
 
 def read_recorded_output(
-    recording: Recording, name: str, asked: RecordedOutput, *, gate_m: float = 3.0, max_gap_s: float = MAX_GAP_S
+    recording: Recording, name: str, config: RecordedOutput, *, gate_m: float = 3.0, max_gap_s: float = MAX_GAP_S
 ) -> tuple[RecordedLists, list[str]]:
     """A stack's lists, captured at the instants that their states are of and arriving when available; and notes.
 
     Raises RecordingError: no such topic, a message that cannot be decoded, no covariance from anywhere.
     """
-    predicted = asked.tells_of == "available"
+    predicted = config.tells_of == "available"
     lists, notes = read_recorded_unit(
-        recording, name, asked, gate_m=gate_m, max_gap_s=max_gap_s, called="configuration", held=not predicted
+        recording, name, config, gate_m=gate_m, max_gap_s=max_gap_s, noun="configuration", checked=not predicted
     )
     stamp_ns = recording.scene.t0_ns + np.rint(lists.tracks.common_arrives_s * 1e9).astype(np.int64)
     behind_ns = lists.logged_ns - stamp_ns

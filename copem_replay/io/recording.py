@@ -57,7 +57,7 @@ _SHOWN = 12  # ids or topics named in an error; the rest is counted
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class KnownLog:
-    """What is known of a log that was read, whether its content is in memory (`Recording`) or not."""
+    """The facts of a log that was read, whether its content is in memory (`Recording`) or not."""
 
     scene: Scene
     path: Path
@@ -71,12 +71,12 @@ class KnownLog:
 
     @property
     def place(self) -> Place:
-        """Where it lies: a file or folder, or several, or under a URL."""
+        """Its place: a file or folder, or several, or a URL."""
         return self.remote or self.local
 
     @property
     def local(self) -> Local:
-        """What it was read from on this machine."""
+        """The place on this machine that it was read from."""
         return self.path if self.together is None else self.together
 
     @property
@@ -127,7 +127,7 @@ def read_log(
     ego: str | EgoTopic | None = None,
     topic: str | None = None,
     fields: Fields | None = None,
-    beside: Collection[str] = (),
+    unit_topics: Collection[str] = (),
     window_s: WindowSeconds = None,
     max_gap_s: float = MAX_GAP_S,
     classes: Mapping[str, str] | None = None,
@@ -136,7 +136,7 @@ def read_log(
 
     `ego`: id of the ego vehicle, or the topic of its poses; None for the host vehicle that the log names, else that of
     the only odometry. `topic`: that of the truth, None where there is only one candidate; `fields`: which fields of its
-    messages hold what, None where the schema is known. `beside`: topics that recorded units read.
+    messages hold what, None where the schema is known. `unit_topics`: topics that recorded units read.
     `window_s`: read only what was logged from one instant to another, both included, in seconds since the first message
     on the topic of the truth was logged; None: from the beginning, to the end. `max_gap_s`: velocities that messages do
     not state are derived, and poses interpolated, across no longer gap. `classes`: of names, beside
@@ -146,7 +146,7 @@ def read_log(
     """
 
     def read(log: Log) -> Recording:
-        return _read(log, name, ego, topic, fields, beside, window_s, max_gap_s, classes or {})
+        return _read(log, name, ego, topic, fields, unit_topics, window_s, max_gap_s, classes or {})
 
     if isinstance(source, Log):
         return read(source)
@@ -169,19 +169,19 @@ def _read(
     ego: str | EgoTopic | None,
     topic: str | None,
     fields: Fields | None,
-    beside: Collection[str],
+    unit_topics: Collection[str],
     window_s: WindowSeconds,
     max_gap_s: float,
     classes: Mapping[str, str],
 ) -> Recording:
-    asked = None if isinstance(ego, str) else ego
-    topic, ignored = choose_topic(log, topic, beside, fields, asked)
+    ego_spec = None if isinstance(ego, str) else ego
+    topic, ignored = choose_topic(log, topic, unit_topics, fields, ego_spec)
 
     def decode(log: Log) -> tuple[Log, tuple[DecodedObjects, LogContext | None, str]]:
         cut = cut_window(log, topic, window_s, max_gap_s)
-        return cut, _decode_world(cut, topic, fields, asked, classes, seek_ego=ego is None, max_gap_s=max_gap_s)
+        return cut, _decode_world(cut, topic, fields, ego_spec, classes, seek_ego=ego is None, max_gap_s=max_gap_s)
 
-    log, (columns, around, world) = log.attempt(decode)
+    log, (columns, context, world) = log.attempt(decode)
     refuse_second_run(columns.stamp_ns, columns.log_time_ns, partial(list_contents, columns), log.path, topic)
     try:
         scene, truth, truth_notes = assemble_truth(columns, name, max_gap_s)
@@ -195,22 +195,22 @@ def _read(
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, host_notes = _find_host(columns.hosts)
-    if apart := _find_apart(around, truth):
-        if asked is not None:
+    if apart := _find_apart(context, truth):
+        if ego_spec is not None:
             raise EgoError(f"{apart[0]}; `ego: none` replays without it", path=log.path)
         host, host_notes = None, apart
     ego_ix, ego_notes = _find_ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _describe_damage(log, topic, scene.end_s)
     window_lines = window_notes(window_s)
     notes = [*([damage] if damage else []), *window_lines, *log.notes, *ignored, *notes, *host_notes, *ego_notes]
-    sized = around is None or around.ego is None or (asked is not None and asked.size_m is not None)
+    sized = context is None or context.ego is None or (ego_spec is not None and ego_spec.size_m is not None)
     sized = sized or find_rule(columns.notes, "ego listed") is not None
     scene = replace(scene, ego_ix=ego_ix, ego_sized=sized, tags=dict(log.tags), areas=columns.areas)
     all_notes = tuple(map(as_finding, notes))
     encoding = next(c.encoding for c in log.channels if c.topic == topic and c.messages)
     return Recording(
         scene=scene, truth=truth, path=log.path, topic=topic, notes=all_notes, host_id=host, damage=damage,
-        around=around, encoding=encoding, world=world, window=log.window, lane_boundaries=columns.lane_boundaries,
+        around=context, encoding=encoding, world=world, window=log.window, lane_boundaries=columns.lane_boundaries,
         lanes=columns.lanes, place_said=columns.place, together=find_drive_recordings(log),
     )  # fmt: skip
 
@@ -245,9 +245,9 @@ def foreign_channels(log: Log) -> list[Channel]:
 def choose_topic(
     log: Log,
     topic: str | None = None,
-    beside: Collection[str] = (),
+    unit_topics: Collection[str] = (),
     fields: Fields | None = None,
-    asked: EgoTopic | None = None,
+    ego_spec: EgoTopic | None = None,
 ) -> tuple[str, list[str]]:
     """The topic of the truth, and notes on what is not read. Raises RecordingError: none, or several candidates."""
     if not any(c.messages for c in log.channels):
@@ -263,7 +263,7 @@ def choose_topic(
             raise RecordingError(
                 f"no true objects on topic {topic!r}; messages are on {_name_topics(topics)}", path=log.path, key=_TOPIC
             )
-        return topic, _describe_ignored(log, topic, {topic: topics[topic]}, beside, poses_read=True)
+        return topic, _describe_ignored(log, topic, {topic: topics[topic]}, unit_topics, poses_read=True)
     if not topics:
         units = any(c.messages and (c.schema == osi.SENSOR_DATA or is_list(c)) for c in log.channels)
         raise RecordingError(
@@ -276,16 +276,16 @@ def choose_topic(
         raise RecordingError(
             f"no true objects on topic {topic!r}; they are on {_name_topics(topics)}", path=log.path, key=_TOPIC
         )
-    chosen = topic if topic is not None else _only_topic(topics)
-    if chosen is None:
+    truth_topic = topic if topic is not None else _only_topic(topics)
+    if truth_topic is None:
         raise RecordingError(
             f"true objects on several topics, {_name_topics(topics)}: "
             "choose one with `read: {topic: …}` in the experiment",
             path=log.path,
             key=() if find_drive_recordings(log) is None else ("together",),
         )
-    poses_read = asked is not None or topics[chosen] not in osi.TRUTH_SCHEMAS
-    return chosen, _describe_ignored(log, chosen, topics, beside, poses_read=poses_read)
+    poses_read = ego_spec is not None or topics[truth_topic] not in osi.TRUTH_SCHEMAS
+    return truth_topic, _describe_ignored(log, truth_topic, topics, unit_topics, poses_read=poses_read)
 
 
 def _advise_reading(log: Log) -> str:
@@ -312,10 +312,10 @@ def _only_topic(topics: dict[str, str]) -> str | None:
 
 
 def _describe_ignored(
-    log: Log, chosen: str, topics: dict[str, str], beside: Collection[str], *, poses_read: bool
+    log: Log, truth_topic: str, topics: dict[str, str], unit_topics: Collection[str], *, poses_read: bool
 ) -> list[str]:
     """Notes on topics and messages that are not read; `poses_read`: whether poses are."""
-    notes = [f"topic {t} ({schema}) not read: {chosen} taken" for t, schema in topics.items() if t != chosen]
+    notes = [f"topic {t} ({schema}) not read: {truth_topic} taken" for t, schema in topics.items() if t != truth_topic]
     skipped = Counter[str]()
     poses: set[int] = set()
     if poses_read and (others := foreign_channels(log)):
@@ -324,7 +324,7 @@ def _describe_ignored(
         has_messages = channel.messages and channel.number not in poses
         # A topic of the truth may hold messages of another schema, too.
         of_topic = is_truth(channel) or channel.schema == topics.get(channel.topic)
-        beside_it = channel.topic in beside or channel.schema == osi.EMBEDDED_MAP
+        beside_it = channel.topic in unit_topics or channel.schema == osi.EMBEDDED_MAP
         if has_messages and not (channel.topic in topics and of_topic) and not beside_it:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{count_noun(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
@@ -334,7 +334,7 @@ def _decode_world(
     log: Log,
     topic: str,
     fields: Fields | None,
-    asked: EgoTopic | None,
+    ego_spec: EgoTopic | None,
     classes: Mapping[str, str],
     *,
     seek_ego: bool,
@@ -354,17 +354,17 @@ def _decode_world(
         )
     if fields is None and any(is_truth(c) for c in channels):
         columns = _decode_topic(log, topic)
-        if asked is None:
+        if ego_spec is None:
             return columns, None, ""
         from copem_replay.io.frames import add_ego, read_log_context
 
-        around = read_log_context(log, asked, seek_ego=False, max_gap_s=max_gap_s)
-        return _add_notes(add_ego(columns, around.ego, around.asked, around.ego_topic), around), around, ""
+        context = read_log_context(log, ego_spec, seek_ego=False, max_gap_s=max_gap_s)
+        return _add_notes(add_ego(columns, context.ego, context.asked, context.ego_topic), context), context, ""
     from copem_replay.io.frames import add_ego, read_decoded_lists, read_log_context, transform_to_world
 
-    around = read_log_context(log, asked, seek_ego=seek_ego, max_gap_s=max_gap_s)
+    context = read_log_context(log, ego_spec, seek_ego=seek_ego, max_gap_s=max_gap_s)
     same_schema = [c for c in channels if (c.schema, c.encoding) == (channels[0].schema, channels[0].encoding)]
-    around = replace(around, classes=classes)
+    context = replace(context, classes=classes)
     lists = read_decoded_lists(log, same_schema, fields, classes)
     if lists.station is not None:
         raise RecordingError("its positions are relative to stations; " + _NO_TRUTH, path=log.path, topic=topic)
@@ -372,9 +372,9 @@ def _decode_world(
         raise RecordingError("its objects have no ids; " + _NO_TRUTH, path=log.path, topic=topic)
     if not lists.named and len(lists.columns.object_ix):
         raise RecordingError("its objects have no ids, all are empty; " + _NO_TRUTH, path=log.path, topic=topic)
-    world = around.world_of(lists)
-    lists = transform_to_world(lists, around, log.path, topic)
-    return _add_notes(add_ego(lists.columns, around.ego, around.asked, around.ego_topic), around), around, world
+    world = context.world_of(lists)
+    lists = transform_to_world(lists, context, log.path, topic)
+    return _add_notes(add_ego(lists.columns, context.ego, context.asked, context.ego_topic), context), context, world
 
 
 def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
@@ -444,13 +444,13 @@ def _find_host(hosts: Sequence[str]) -> tuple[str | None, list[str]]:
     return counts[0][0], [f"the host vehicle changes ({ids}): the most frequent taken"]
 
 
-def _find_apart(around: LogContext | None, truth: Tracks) -> list[str]:
+def _find_apart(context: LogContext | None, truth: Tracks) -> list[str]:
     """The finding that the ego's poses and the lists have no instant in common; none: they have."""
-    if around is None or around.ego is None:
+    if context is None or context.ego is None:
         return []
-    (first, last), (start, end) = ((ns[0] * 1e-9, ns[-1] * 1e-9) for ns in (around.ego.stamp_ns, truth.stamp_ns))
+    (first, last), (start, end) = ((ns[0] * 1e-9, ns[-1] * 1e-9) for ns in (context.ego.stamp_ns, truth.stamp_ns))
     apart = max(first - end, start - last)
-    topic = around.ego_topic
+    topic = context.ego_topic
     return [*find("two clocks", int(apart > 0), topic=topic, first=first, last=last, start=start, end=end, apart=apart)]
 
 

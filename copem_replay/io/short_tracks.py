@@ -38,7 +38,7 @@ class ListPoints:
     track: Int
 
     def thinned(self, most: int) -> ListPoints:
-        """About `most` of the entries: every n-th list, whole."""
+        """About `most` entries: every n-th list, whole."""
         every = -(-len(self.time_s) // most)
         return self.take(np.flatnonzero(self.list_ix % every == 0)) if every > 1 else self
 
@@ -119,8 +119,8 @@ class ShortTracks:
         entries = np.stack([other.x_m, other.y_m, instant_ix * _APART_M], axis=1)
         points = np.stack([states.x_m, states.y_m, instant * _APART_M], axis=1)
         if not len(moving):
-            none = np.empty(0, dtype=np.int64)
-            return none, _take_states(states, none), np.empty(0)
+            empty = np.empty(0, dtype=np.int64)
+            return empty, _take_states(states, empty), np.empty(0)
         from scipy.spatial import cKDTree  # it takes long to import
 
         away_m, point = cKDTree(points).query(entries, distance_upper_bound=gate_m)
@@ -172,27 +172,27 @@ def _smooth_points(entries: ListPoints, window_s: float, gap_s: float) -> ShortT
     axis = time_s + track * (float(np.ptp(time_s)) + 10 * window_s)
     low, high = np.searchsorted(axis, axis - window_s), np.searchsorted(axis, axis + window_s, side="right")
     here = np.arange(len(axis))
-    kept = np.flatnonzero((here - low >= _EACH_SIDE) & (high - here > _EACH_SIDE))
-    sums = [np.zeros(len(kept)) for _ in range(5)]
-    right = np.zeros((2, 3, len(kept)))
-    widest = int((high - low)[kept].max()) if len(kept) else 0
+    centres = np.flatnonzero((here - low >= _EACH_SIDE) & (high - here > _EACH_SIDE))
+    sums = [np.zeros(len(centres)) for _ in range(5)]
+    right = np.zeros((2, 3, len(centres)))
+    widest = int((high - low)[centres].max()) if len(centres) else 0
     for n in range(widest):
-        row = low[kept] + n
-        inside = row < high[kept]
+        row = low[centres] + n
+        in_window = row < high[centres]
         row = np.minimum(row, len(axis) - 1)
-        t = np.where(inside, axis[row] - axis[kept], 0.0)
+        t = np.where(in_window, axis[row] - axis[centres], 0.0)
         for power in range(5):
-            sums[power] += np.where(inside, t**power, 0.0)
+            sums[power] += np.where(in_window, t**power, 0.0)
         for axis_ix, values in enumerate((entries.x_m, entries.y_m)):
-            away = np.where(inside, values[row] - values[kept], 0.0)  # small numbers keep their digits
+            away = np.where(in_window, values[row] - values[centres], 0.0)  # small numbers keep their digits
             for power in range(3):
                 right[axis_ix, power] += away * t**power
     normal = np.array([[sums[i + j] for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
     curved = np.linalg.det(normal) != 0  # no parabola goes through entries of one time alone
-    kept, normal, right = kept[curved], normal[curved], right[:, :, curved]
-    solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(kept) else np.empty((0, 3, 2))
-    x_m, y_m = entries.x_m[kept] + solved[:, 0, 0], entries.y_m[kept] + solved[:, 0, 1]
-    return ShortTracks(time_s[kept], track[kept], x_m, y_m, solved[:, 1].T, gap_s, entries)
+    centres, normal, right = centres[curved], normal[curved], right[:, :, curved]
+    solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(centres) else np.empty((0, 3, 2))
+    x_m, y_m = entries.x_m[centres] + solved[:, 0, 0], entries.y_m[centres] + solved[:, 0, 1]
+    return ShortTracks(time_s[centres], track[centres], x_m, y_m, solved[:, 1].T, gap_s, entries)
 
 
 def follow_points(entries: ListPoints, gap_s: float) -> Int:
@@ -200,34 +200,34 @@ def follow_points(entries: ListPoints, gap_s: float) -> Int:
     track = np.full(len(entries.time_s), -1)
     bounds = np.flatnonzero(np.diff(entries.list_ix, prepend=-1, append=-1))
     place, velocity, seen_s, names = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64)
-    number, seen = 0, np.empty(0, dtype=np.int64)
+    number, n_seen = 0, np.empty(0, dtype=np.int64)
     for begin, end in pairwise(bounds.tolist()):
-        now_s, here = entries.time_s[begin], np.stack([entries.x_m[begin:end], entries.y_m[begin:end]], axis=1)
+        now_s, entry_m = entries.time_s[begin], np.stack([entries.x_m[begin:end], entries.y_m[begin:end]], axis=1)
         alive = now_s - seen_s <= gap_s
-        place, velocity, seen_s, names, seen = (a[alive] for a in (place, velocity, seen_s, names, seen))
+        place, velocity, seen_s, names, n_seen = (a[alive] for a in (place, velocity, seen_s, names, n_seen))
         since_s = now_s - seen_s
         follows = np.full(end - begin, -1)
         if len(names):
-            away_m = np.hypot(*(here[:, None] - (place + velocity * since_s[:, None])[None]).transpose(2, 0, 1))
+            away_m = np.hypot(*(entry_m[:, None] - (place + velocity * since_s[:, None])[None]).transpose(2, 0, 1))
             nearest_track, nearest_entry = away_m.argmin(axis=1), away_m.argmin(axis=0)
             rows = np.arange(end - begin)
             mutual = (nearest_entry[nearest_track] == rows) & (
                 away_m[rows, nearest_track]
-                <= 2.5 + np.where(seen[nearest_track] > 1, 5.0, 35.0) * since_s[nearest_track]
+                <= 2.5 + np.where(n_seen[nearest_track] > 1, 5.0, 35.0) * since_s[nearest_track]
             )
             follows[mutual] = nearest_track[mutual]
-        old, fresh = np.flatnonzero(follows >= 0), np.flatnonzero(follows < 0)
+        old, new = np.flatnonzero(follows >= 0), np.flatnonzero(follows < 0)
         if len(old):
             k = follows[old]
-            residual, second = here[old] - (place[k] + velocity[k] * since_s[k, None]), (seen[k] == 1)[:, None]
+            residual, second = entry_m[old] - (place[k] + velocity[k] * since_s[k, None]), (n_seen[k] == 1)[:, None]
             gain = np.clip(1 - np.exp(-since_s[k, None] / _SETTLED_S), 0.3, 0.7)
             velocity[k] += np.where(second, 1.0, gain**2 / (2 - gain)) * residual / np.maximum(since_s[k, None], 1e-3)
-            place[k] = np.where(second, here[old], here[old] - (1 - gain) * residual)
+            place[k] = np.where(second, entry_m[old], entry_m[old] - (1 - gain) * residual)
             seen_s[k] = now_s
-            seen[k] += 1
+            n_seen[k] += 1
             track[begin + old] = names[k]
-        track[begin + fresh] = number + np.arange(len(fresh))
-        place, velocity = np.concatenate([place, here[fresh]]), np.concatenate([velocity, np.zeros((len(fresh), 2))])
-        seen_s, names = np.append(seen_s, np.full(len(fresh), now_s)), np.append(names, track[begin + fresh])
-        number, seen = number + len(fresh), np.append(seen, np.ones(len(fresh), dtype=np.int64))
+        track[begin + new] = number + np.arange(len(new))
+        place, velocity = np.concatenate([place, entry_m[new]]), np.concatenate([velocity, np.zeros((len(new), 2))])
+        seen_s, names = np.append(seen_s, np.full(len(new), now_s)), np.append(names, track[begin + new])
+        number, n_seen = number + len(new), np.append(n_seen, np.ones(len(new), dtype=np.int64))
     return track

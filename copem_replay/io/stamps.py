@@ -81,13 +81,13 @@ def _parse_date(word: str) -> int | None:
         return None
     *parts, fraction, sign, hours, minutes = found.groups()
     try:
-        whole = datetime(*map(int, parts), tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]
+        since_epoch = datetime(*map(int, parts), tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]
     except ValueError:  # the 30th of February
         return None
     ahead = timedelta(hours=int(hours or 0), minutes=int(minutes or 0))
-    whole += ahead if sign == "-" else -ahead
+    since_epoch += ahead if sign == "-" else -ahead
     nanos = round(Decimal(f"0.{fraction or 0}") * 10**9)
-    return (whole.days * 86_400 + whole.seconds) * 10**9 + nanos
+    return (since_epoch.days * 86_400 + since_epoch.seconds) * 10**9 + nanos
 
 
 # Stamps against the times of logging.
@@ -102,19 +102,19 @@ _ALIKE = 0.9
 
 
 def settle_stamps(
-    stamp_ns: Int, stamped: Bool, log_time_ns: Int, *, ahead_ns: Int | int = 0, noun: str = "message", told: int = 0
+    stamp_ns: Int, stamped: Bool, log_time_ns: Int, *, ahead_ns: Int | int = 0, noun: str = "message", noted: int = 0
 ) -> tuple[Int, Bool, Bool, list[Finding]]:
     """(F,) stamps, whether each is stated, whether its message is kept, and findings.
 
     `stamp_ns`: by the clock of the log times, which that of the messages is ahead of by `ahead_ns`. A stamp is not set
     where it is 0 in several messages, or of another clock than its neighbours'. The time of logging is taken then, by
     the clock of the stamps where both clocks run alike; where they do not, a message that was logged at another time
-    than all stamps is left out. `told`: so many stamps are impossible, and told of.
+    than all stamps is left out. `noted`: so many stamps are impossible, and told of.
     """
     unset = _find_unset(stamp_ns, stamped, log_time_ns, stamp_ns + ahead_ns == 0)
-    known, kept, findings = stamped & ~unset, np.ones(len(stamp_ns), dtype=bool), list[Finding]()
+    known, keep, findings = stamped & ~unset, np.ones(len(stamp_ns), dtype=bool), list[Finding]()
     if known.all():
-        return stamp_ns, known, kept, findings
+        return stamp_ns, known, keep, findings
     settled = np.where(known, stamp_ns, log_time_ns)
     if known.any():
         apart_ns = stamp_ns[known] - log_time_ns[known]
@@ -124,13 +124,13 @@ def settle_stamps(
             settled = np.where(known, stamp_ns, log_time_ns + offset_ns)
         around_ns = _LEAP_NS if alike else SLACK_NS
         span = stamp_ns[known].min() - around_ns, stamp_ns[known].max() + around_ns
-        kept = known | ((settled >= span[0]) & (settled <= span[1]))
+        keep = known | ((settled >= span[0]) & (settled <= span[1]))
     zero, odd = (unset & (stamp_ns + ahead_ns == 0)), unset & (stamp_ns + ahead_ns != 0)
-    findings += find("stamp absent", max(int((kept & ~stamped).sum()) - told, 0), noun=noun)
-    findings += find("stamp zero", int((kept & zero).sum()), noun=noun)
-    findings += find("stamp odd", int((kept & odd).sum()), noun=noun)
-    findings += find("stamp lost", int((~kept).sum()), noun=noun)
-    return settled, known, kept, findings
+    findings += find("stamp absent", max(int((keep & ~stamped).sum()) - noted, 0), noun=noun)
+    findings += find("stamp zero", int((keep & zero).sum()), noun=noun)
+    findings += find("stamp odd", int((keep & odd).sum()), noun=noun)
+    findings += find("stamp lost", int((~keep).sum()), noun=noun)
+    return settled, known, keep, findings
 
 
 def _find_unset(stamp_ns: Int, stamped: Bool, log_time_ns: Int, zero: Bool) -> Bool:
@@ -178,22 +178,22 @@ def find_runs(stamp_ns: Int, log_time_ns: Int) -> Int:
 def refuse_second_run(
     stamp_ns: Int, log_time_ns: Int, list_contents: Callable[[], Sequence[bytes]], path: Path, topic: str
 ) -> None:
-    """Raises RecordingError: messages are of several runs. Repeats of a run, message by message, are none.
+    """Raises RecordingError where messages are of several runs, unless a run repeats the first message by message.
 
-    `list_contents`: gives what each message says, as bytes.
+    `list_contents`: gives the content of each message, as bytes.
     """
     run = find_runs(stamp_ns, log_time_ns)
     if not run.any():
         return
     start_ns, contents = int(log_time_ns.min()), list_contents()
-    said = {(int(stamp_ns[k]), contents[k]) for k in np.flatnonzero(run == 0).tolist()}
+    messages = {(int(stamp_ns[k]), contents[k]) for k in np.flatnonzero(run == 0).tolist()}
     latest_ns = int(stamp_ns[run == 0].max())
     for number in range(1, int(run.max()) + 1):
         rows = np.flatnonzero(run == number)
         again = [(int(stamp_ns[k]), contents[k]) for k in rows.tolist()]
-        if any(one not in said and one[0] <= latest_ns + SAME_INSTANT_NS for one in again):
+        if any(one not in messages and one[0] <= latest_ns + SAME_INSTANT_NS for one in again):
             break
-        said.update(again)
+        messages.update(again)
         latest_ns = max(latest_ns, int(stamp_ns[rows].max()))
     else:
         return

@@ -63,10 +63,10 @@ def _is_on_earth(place_deg: Float) -> Bool:
     return known
 
 
-def _take_messages(lists: DecodedLists, kept: Bool) -> DecodedLists:
-    """The lists `kept` (F,)."""
-    lists = lists.take_rows(np.repeat(kept, lists.columns.rows))
-    return replace(lists, columns=take_messages(lists.columns, kept))
+def _take_messages(lists: DecodedLists, keep: Bool) -> DecodedLists:
+    """The lists `keep` (F,)."""
+    lists = lists.take_rows(np.repeat(keep, lists.columns.rows))
+    return replace(lists, columns=take_messages(lists.columns, keep))
 
 
 def settle_measurements(
@@ -81,23 +81,23 @@ def settle_measurements(
     measured_s = np.zeros(0) if lists.station is None else lists.station.after_s
     apart_ns = np.sort((columns.log_time_ns - columns.stamp_ns)[columns.stamped])
     median_ns = int(apart_ns[len(apart_ns) // 2]) if len(apart_ns) else 0
-    said = columns.stamped & (abs(median_ns) <= SLACK_NS)
-    notes += find("station clock", int((columns.stamped & ~said).sum()), apart=median_ns * 1e-9)
+    is_stated = columns.stamped & (abs(median_ns) <= SLACK_NS)
+    notes += find("station clock", int((columns.stamped & ~is_stated).sum()), apart=median_ns * 1e-9)
     middles = (np.sort(of)[(len(of) - 1) // 2 :] for of in np.split(measured_s, np.cumsum(columns.rows)[:-1]))
     after_s = np.array([middle[0] if len(middle) else 0.0 for middle in middles])
     away_s = np.repeat(after_s, columns.rows) - measured_s
     values = columns.values.copy()
     values[:, :2] += away_s[:, None] * np.nan_to_num(values[:, VX : VY + 1])
     notes += find("measured apart", int((away_s != 0).sum()), most=float(np.abs(away_s).max(initial=0.0)))
-    captured_ns = np.where(said, columns.stamp_ns, columns.log_time_ns) + np.rint(after_s * 1e9).astype(np.int64)
-    kept = captured_ns >= t0_ns - SLACK_NS
-    if len(kept) and not kept.any():
-        older = f"all of its {count_noun(len(kept), 'message')} are older than the log"
+    captured_ns = np.where(is_stated, columns.stamp_ns, columns.log_time_ns) + np.rint(after_s * 1e9).astype(np.int64)
+    keep = captured_ns >= t0_ns - SLACK_NS
+    if len(keep) and not keep.any():
+        older = f"all of its {count_noun(len(keep), 'message')} are older than the log"
         before_s = (t0_ns - captured_ns.max()) * 1e-9
         raise RecordingError(f"{older}, the last one by {before_s:.3g} s", path=path, topic=topic)
-    notes += find("older", int((~kept).sum()))
+    notes += find("older", int((~keep).sum()))
     arrived = replace(columns, values=values, stamp_ns=columns.log_time_ns, notes=tuple(notes))
-    return _take_messages(replace(lists, columns=arrived), kept), (captured_ns[kept], said[kept])
+    return _take_messages(replace(lists, columns=arrived), keep), (captured_ns[keep], is_stated[keep])
 
 
 class StationViews(NamedTuple):

@@ -60,11 +60,11 @@ def check_truth(rows: TrackRows, places: bool, findings: list[str]) -> tuple[Tra
             "`read: {topic: …, yaw_rad: {degrees: …}, …}`"
         )
     before = len(findings)
-    rows, kept = cut_jumps(rows, findings)
+    rows, keep = cut_jumps(rows, findings)
     cut = len(findings) - before
     if places and cut:
         findings += find("places", cut)
-    states = np.flatnonzero(kept)
+    states = np.flatnonzero(keep)
     states = states[np.argsort(rows.object_ix[states], kind="stable")]
     if cut:
         rows = replace(rows, **{n: getattr(rows, n)[states] for n in ("object_ix", "time_s", "class_ix", "values")})
@@ -79,26 +79,26 @@ def cut_jumps(rows: TrackRows, findings: list[str]) -> tuple[TrackRows, Bool]:
     """
     same, apart_s = _steps(rows)
     jumps = same & (_find_jumps(rows, same, apart_s) | _find_reuse(rows, apart_s)) & rows.moving[rows.object_ix[1:]]
-    kept, object_ix = np.ones(len(rows.object_ix), dtype=bool), rows.object_ix.copy()
+    keep, object_ix = np.ones(len(rows.object_ix), dtype=bool), rows.object_ix.copy()
     ids, moving = list(rows.ids), rows.moving.tolist()
     for number in np.unique(rows.object_ix[1:][jumps]).tolist():
-        whole = np.flatnonzero(rows.object_ix == number)
-        groups = _join_pieces(rows, np.split(whole, np.flatnonzero(jumps[whole[:-1]]) + 1))
+        track_rows = np.flatnonzero(rows.object_ix == number)
+        groups = _join_pieces(rows, np.split(track_rows, np.flatnonzero(jumps[track_rows[:-1]]) + 1))
         longest = max(groups, key=len)
-        first = int(whole[np.flatnonzero(jumps[whole[:-1]])[0] + 1])
+        first = int(track_rows[np.flatnonzero(jumps[track_rows[:-1]])[0] + 1])
         findings += find(
             "jump", len(groups) - 1, id=ids[number], at=rows.time_s[first], far=_step_m(rows)[first - 1],
-            share=1 - len(longest) / len(whole),
+            share=1 - len(longest) / len(track_rows),
         )  # fmt: skip
         for name, group in enumerate((group for group in groups if group is not longest), 2):
             inside = rows.time_s[longest[0]] < rows.time_s[group[0]] < rows.time_s[longest[-1]]
             if inside or len(group) < _FEWEST:
-                kept[group] = False
+                keep[group] = False
                 continue
             object_ix[group] = len(ids)
             ids.append(f"{rows.ids[number]}/{name}")
             moving.append(True)
-    return replace(rows, ids=tuple(ids), object_ix=object_ix, moving=np.array(moving, dtype=bool)), kept
+    return replace(rows, ids=tuple(ids), object_ix=object_ix, moving=np.array(moving, dtype=bool)), keep
 
 
 def _steps(rows: TrackRows) -> tuple[Bool, Float]:
@@ -114,11 +114,11 @@ def _step_m(rows: TrackRows) -> Float:
 
 def _find_jumps(rows: TrackRows, same: Bool, apart_s: Float) -> Bool:
     """(P − 1,) steps that are too far: for the class, or for the speed beside them and any acceleration."""
-    far = _step_m(rows)
-    speed = np.where(same, far / np.maximum(apart_s, 1e-9), np.inf)
+    step_m = _step_m(rows)
+    speed = np.where(same, step_m / np.maximum(apart_s, 1e-9), np.inf)
     around = np.minimum(np.append(np.inf, speed[:-1]), np.append(speed[1:], np.inf))
     most_mps = np.minimum(around + _HARDEST_MPS2 * apart_s, _FASTEST_MPS[rows.class_ix[1:]])
-    jumps: Bool = far > _SLACK_M + most_mps * apart_s
+    jumps: Bool = step_m > _SLACK_M + most_mps * apart_s
     return jumps
 
 
@@ -162,22 +162,22 @@ def check_directions(rows: TrackRows, findings: list[str]) -> Float:
     values = rows.values
     stated = np.hypot(values[:, VX], values[:, VY]) > _MOVING_MPS / 2
     across = np.abs(wrap_angles(np.arctan2(values[:, VY], values[:, VX]) - course_rad)) > _ACROSS_RAD
-    for number, at, share in _find_contradicted(rows, moves & stated, across):
-        mine = rows.object_ix == number
-        findings += find("twist", int(mine.sum()), id=rows.ids[number], at=at, share=share)
+    for number, instant, share in _find_contradicted(rows, moves & stated, across):
+        of_object = rows.object_ix == number
+        findings += find("twist", int(of_object.sum()), id=rows.ids[number], at=instant, share=share)
         values = values if values is not rows.values else values.copy()
-        values[mine, VX : VY + 1] = np.nan
+        values[of_object, VX : VY + 1] = np.nan
     off_rad = np.abs(wrap_angles(values[:, YAW] - course_rad))
     vehicles = moves & (rows.class_ix != CLASSES.index("pedestrian")) & (rows.class_ix != CLASSES.index("animal"))
     aside = (off_rad > _ACROSS_RAD) & (off_rad < np.pi - _ACROSS_RAD)
-    for number, at, share in _find_contradicted(rows, vehicles, aside):
-        findings += find("heading", 1, id=rows.ids[number], at=at, share=share)
+    for number, instant, share in _find_contradicted(rows, vehicles, aside):
+        findings += find("heading", 1, id=rows.ids[number], at=instant, share=share)
     same, _ = _steps(rows)
     flips = same & (np.abs(wrap_angles(np.diff(values[:, YAW]))) > _FLIP_RAD) & vehicles[1:]
     for number in np.unique(rows.object_ix[1:][flips]).tolist():
-        mine = np.flatnonzero(flips & (rows.object_ix[1:] == number)) + 1
-        share = len(mine) / (rows.object_ix == number).sum()
-        findings += find("flip", len(mine), id=rows.ids[number], at=rows.time_s[mine[0]], share=share)
+        of_object = np.flatnonzero(flips & (rows.object_ix[1:] == number)) + 1
+        share = len(of_object) / (rows.object_ix == number).sum()
+        findings += find("flip", len(of_object), id=rows.ids[number], at=rows.time_s[of_object[0]], share=share)
     return values
 
 
@@ -215,7 +215,7 @@ def _find_contradicted(rows: TrackRows, judged: Bool, wrong: Bool) -> list[tuple
 
 
 def are_places(ids: Sequence[str], object_ix: Int, message: Int) -> bool:
-    """Whether ids are places in the list: the number at the end of an id is the row's place in its `message (P,)`."""
+    """Whether ids are places in the list: each ends with the row's place in its `message (P,)`."""
     numbers = np.array([int(t) if t.isdecimal() and len(t) < 9 else -1 for t in (n.rpartition("/")[2] for n in ids)])
     if not len(object_ix) or (numbers[object_ix] < 0).any():
         return False

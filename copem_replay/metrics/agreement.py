@@ -25,7 +25,7 @@ _MOVES_MPS: Final = 1.0
 _ALONG_RAD: Final = math.pi / 4
 
 _REACH_M: Final = 40.0
-"""The shift is sought this far from where the map is said to be."""
+"""The largest offset of the map that is searched."""
 _CELL_M: Final = 0.5
 _HEADINGS: Final = 16
 _MOST_STATES: Final = 3000
@@ -36,30 +36,30 @@ _ELSEWHERE_M: Final = 3.0
 
 @dataclass(frozen=True)
 class Agreement:
-    """Of `states` of moving vehicles, `along` are in a lane of their heading."""
+    """The number of `states` of moving vehicles, and how many of them, `along`, are in a lane of their heading."""
 
     states: int
     along: int
 
     @property
     def share(self) -> float | None:
-        """None: no vehicle moves."""
+        """The share of states along a lane; None: no vehicle moves."""
         return self.along / self.states if self.states else None
 
     @property
     def words(self) -> str:
-        """One line, without the map's name."""
+        """The agreement in one line, without the map's name."""
         if self.share is None:
             return "agreement with the traffic unknown: no vehicle moves"
-        told = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
-        told += " vehicles are in a lane of their heading"
+        line = f"agreement with the traffic {self.share:.2f}: {self.along:,} of {self.states:,} states of moving"
+        line += " vehicles are in a lane of their heading"
         if self.states < _FEWEST:
-            return f"{told}; too few to conclude from"
-        return told + ("; is the map in the frame of the log? (1–2 m are not seen)" if self.share < NOTED_BELOW else "")
+            return f"{line}; too few to conclude from"
+        return line + ("; is the map in the frame of the log? (1–2 m are not seen)" if self.share < NOTED_BELOW else "")
 
     @property
     def refused(self) -> bool:
-        """Whether the map cannot be where the traffic is."""
+        """Whether the share is too low for the map to be in the log's frame."""
         return self.share is not None and self.states >= _FEWEST and self.share < REFUSED_BELOW
 
 
@@ -69,19 +69,19 @@ SOLIDS_REFUSED_ABOVE: Final = 0.1
 
 @dataclass(frozen=True)
 class Inside:
-    """Of `states` of moving vehicles, `inside` are in a solid of a map."""
+    """The number of `states` of moving vehicles, and how many of them are `inside` a solid of a map."""
 
     states: int
     inside: int
 
     @property
     def share(self) -> float:
-        """0 where no vehicle moves."""
+        """The share of states inside a solid; 0 where no vehicle moves."""
         return self.inside / self.states if self.states else 0.0
 
     @property
     def words(self) -> str:
-        """One line, without the map's name; empty: nothing has to be said."""
+        """One line for a suspicious share, without the map's name; empty: nothing to report."""
         if self.states < _FEWEST or self.share <= SOLIDS_NOTED_ABOVE:
             return ""
         told = f"{self.inside:,} of {self.states:,} states of moving vehicles are inside a solid"
@@ -89,14 +89,14 @@ class Inside:
 
     @property
     def refused(self) -> bool:
-        """Whether the map cannot be where the traffic is."""
+        """Whether the share is too high for the map to be in the log's frame."""
         return self.states >= _FEWEST and self.share > SOLIDS_REFUSED_ABOVE
 
 
 def find_inside(scene: Scene, truth: Tracks, outlines: NDArray[np.object_]) -> Inside:
-    """How often the centre of a moving vehicle is in one of the outlines of solids: polygons as shapely has them.
+    """Count the states of moving vehicles whose centre is in an outline of a solid (shapely polygons).
 
-    Of a map without lanes this is what agreement can be told by.
+    It stands in for agreement where a map has no lanes.
     """
     import shapely
 
@@ -115,7 +115,7 @@ def moving_vehicle_rows(scene: Scene, truth: Tracks) -> Int:
 
 
 def find_agreement(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Agreement:
-    """Agreement of lanes, in the frame of the log, with its traffic."""
+    """The agreement of lanes, given in the log's frame, with the log's traffic."""
     rows = moving_vehicle_rows(scene, truth)
     directed = DirectedLanes(lanes)
     along = directed.are_along(truth.x_m[0, rows], truth.y_m[0, rows], truth.yaw_rad[0, rows])
@@ -123,7 +123,7 @@ def find_agreement(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Agreem
 
 
 class DirectedLanes:
-    """Lanes that are driven, cut across into quadrangles with a direction each."""
+    """Driven lanes, cut across into quadrangles with a direction each."""
 
     def __init__(self, lanes: Sequence[Lane]) -> None:
         import shapely
@@ -156,7 +156,7 @@ def _cut_lane(lane: Lane) -> tuple[Float, Float]:
 
 @dataclass(frozen=True)
 class Shift:
-    """By how much the map would have to move to agree best, and the best score more than 3 m from there."""
+    """The shift of the map that agrees best with the traffic, and the best score more than 3 m from it."""
 
     east_m: float
     north_m: float
@@ -166,13 +166,13 @@ class Shift:
 
     @property
     def words(self) -> str:
-        """One line; it is printed and never applied."""
-        told = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
+        """The shift in one line; it is printed and never applied."""
+        line = f"best agreement with the map moved by [{self.east_m:g}, {self.north_m:g}] m (east, north)"
         ratio = self.elsewhere / self.score if self.score else 1.0
-        told += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"
+        line += f"; the best more than {_ELSEWHERE_M:g} m from there is {ratio:.0%} as good"
         if ratio >= _AS_GOOD:
-            told += f": not determined along {self.elsewhere_deg:.0f}° (from east towards north)"
-        return f"{told}; nothing is moved by itself (`offset_m` of the map does it)"
+            line += f": not determined along {self.elsewhere_deg:.0f}° (from east towards north)"
+        return f"{line}; nothing is moved by itself (`offset_m` of the map does it)"
 
 
 def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift | None:
@@ -191,11 +191,11 @@ def estimate_shift(scene: Scene, truth: Tracks, lanes: Sequence[Lane]) -> Shift 
     move_m = np.where(scores >= _EQUAL * scores.max(), np.hypot(*np.meshgrid(steps_m, steps_m, indexing="ij")), np.inf)
     i, j = np.unravel_index(int(move_m.argmin()), scores.shape)  # of equals the nearest to where the map is
     away_m = np.hypot(*np.meshgrid(steps_m - steps_m[i], steps_m - steps_m[j], indexing="ij"))
-    others = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
-    k, m = np.unravel_index(int(others.argmax()), others.shape)
+    scores_away = np.where(away_m > _ELSEWHERE_M, scores, -1.0)
+    k, m = np.unravel_index(int(scores_away.argmax()), scores_away.shape)
     direction = math.degrees(math.atan2(steps_m[m] - steps_m[j], steps_m[k] - steps_m[i])) % 180.0
     east_m, north_m = -float(steps_m[i]) + 0.0, -float(steps_m[j]) + 0.0  # the traffic moved that way, so the map back
-    return Shift(east_m, north_m, float(scores[i, j]), float(others[k, m]), direction)
+    return Shift(east_m, north_m, float(scores[i, j]), float(scores_away[k, m]), direction)
 
 
 class _HeadingRaster:

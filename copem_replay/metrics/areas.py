@@ -21,7 +21,7 @@ _KINDS: Final = ("crosswalk", "junction", "parking", "drivable")
 
 
 def are_in_areas(x_m: Float, y_m: Float, scene: Scene, names: Sequence[str], experiment: MetricsSetup) -> Bool:
-    """(M,) whether places are in any area of these names or kinds: one's own, or of the log's maps."""
+    """(M,) whether places are in any area of these names or kinds, of the experiment or of the log's maps."""
     inside = np.zeros(len(x_m), dtype=bool)
     for name in names:
         if (own := experiment.areas.get(name)) is not None:

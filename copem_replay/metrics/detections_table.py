@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def concatenate_columns(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Columns by name, those of each part one beneath the other. All parts have the columns of the first."""
+    """Columns by name, the parts one beneath the other. All parts have the columns of the first."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -51,14 +51,14 @@ def build_frame(columns: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def first_episodes(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the first episode of each object: what is drawn of a single run."""
+    """The rows of each object's first episode, as the plots of a single run draw them."""
     first = rows.groupby("object_id", sort=False)["episode"].transform("min") == rows["episode"]
     return rows if first.all() else rows[first]
 
 
 @dataclass(frozen=True)
 class Way:
-    """The way of each detection to the receiver. All (S | 1, M), NaN: there is none.
+    """The times of each detection's list on its way to the receiver. All (S | 1, M), NaN: there is none.
 
     `listed_s`: capture of the first list of any unit that has the object, whether it was sent and arrived or not.
     `sent_s`, `arrived_s`: of the list of the newest capture that contributed to the detection.
@@ -79,17 +79,17 @@ def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, 
     return episodes.join_passes(parts)
 
 
-def _first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
-    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), seen.object_ix.max(initial=-1))) + 2, -1)
+def _first_listed_s(perceived: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
+    episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), perceived.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
-    episode, captured_s = episode_of[seen.row_object_ix], seen.entry_captured_s
-    in_units = np.array([name in units for name in seen.units], dtype=bool)[seen.row_unit_ix]
-    rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(seen.common_arrives_s)[seen.frame_ix])
+    episode, captured_s = episode_of[perceived.row_object_ix], perceived.entry_captured_s
+    in_units = np.array([name in units for name in perceived.units], dtype=bool)[perceived.row_unit_ix]
+    rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(perceived.common_arrives_s)[perceived.frame_ix])
     during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
     from_s = episodes.counts_from_s(count_earlier=count_earlier)
     rows = rows[during & (captured_s[rows] >= from_s[episode[rows]])]
-    first_s = np.full((len(seen.valid), len(episodes.object_ix)), np.inf)
-    for s, valid in enumerate(seen.valid):
+    first_s = np.full((len(perceived.valid), len(episodes.object_ix)), np.inf)
+    for s, valid in enumerate(perceived.valid):
         listed = rows[valid[rows]]
         np.minimum.at(first_s[s], episode[listed], captured_s[listed])
     return np.where(np.isfinite(first_s), first_s, np.nan)
@@ -143,7 +143,7 @@ class DetectionEvents:
 
 
 def stack_events(blocks: Sequence[Mapping[str, DetectionEvents]], runs: Sequence[int]) -> dict[str, DetectionEvents]:
-    """Events by configuration, those of several blocks of so many runs one after the other."""
+    """Events by configuration, with the runs of several blocks stacked in order."""
     return (
         {name: _stack_parts([block[name] for block in blocks], runs) for name in blocks[0]}
         if len(blocks) > 1
@@ -325,12 +325,12 @@ def measure_distances(
     return distance_m, gap_m
 
 
-def box_gap(state: Mapping[str, Float], ego: Reference, both: np.ndarray) -> Float:
-    """(K,) horizontal distance (m) between the boxes, 0 where they touch; NaN where `both` is False."""
+def box_gap(state: Mapping[str, Float], ego: Reference, present: np.ndarray) -> Float:
+    """(K,) horizontal distance (m) between the boxes, 0 where they touch; NaN where `present` is False."""
     import shapely
 
-    gap = np.full(len(both), np.nan)
-    rows = np.flatnonzero(both)
+    gap = np.full(len(present), np.nan)
+    rows = np.flatnonzero(present)
     box = shapely.polygons(
         rectangle_corners(*(state[n][rows] for n in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
     )

@@ -37,7 +37,7 @@ from copem_replay.perception.visibility import Statics, visible_shares
 
 @dataclass(frozen=True)
 class Reference:
-    """The place that distances are measured from: the ego, or a unit when there is no ego. All (K,), NaN where absent.
+    """The place that distances are measured from: the ego, or a unit where there is no ego. All (K,), NaN where absent.
 
     Its box is `length_m × width_m` around its place; a unit is a point.
     """
@@ -100,14 +100,14 @@ class Episodes:
     returns: Int
 
     def take(self, which: Int | Bool) -> Episodes:
-        """Some of the episodes."""
+        """The episodes of these indices."""
         return Episodes(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
     @cached_property
     def passes(self) -> tuple[tuple[Int, Episodes], ...]:
-        """Episodes with at most one of each object, and which they are: the first of each, then the second of each, …
+        """Passes of at most one episode per object, each with its indices: all first episodes, all second ones, …
 
-        What looks up the episode of an object measures them pass by pass (`join_passes`).
+        Code that looks up the episode of an object measures pass by pass; `join_passes` puts the columns together.
         """
         if not len(self.object_ix):
             return ((np.empty(0, dtype=np.int64), self),)
@@ -117,7 +117,7 @@ class Episodes:
         return tuple((which, self.take(which)) for which in each)
 
     def join_passes(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """(…, M) the columns of all episodes, from those of each pass (…, m)."""
+        """(…, M) the columns of all episodes, from the columns of each pass (…, m)."""
         if len(parts) == 1:
             return parts[0]
         order = np.argsort(np.concatenate([which for which, _ in self.passes]))
@@ -140,13 +140,13 @@ class Episodes:
 
     @property
     def firsts(self) -> Episodes:
-        """The first episode of each object, up to where its last ends: what accuracy is measured of."""
+        """One episode per object, from its first onset to the end of its last episode: accuracy is measured in it."""
         which, first = self.passes[0]
         ends = np.append(which, len(self.object_ix))[1:] - 1
         return replace(first, ended_s=self.ended_s[ends], ended_by=self.ended_by[ends])
 
     def count_began(self) -> tuple[int, ...]:
-        """How many episodes began in each of the ways `BEGAN`."""
+        """The number of episodes by how they began, in the order of `BEGAN`."""
         return tuple(np.bincount(self.began, minlength=len(BEGAN)).tolist())
 
     def counts_from_s(self, *, count_earlier: bool) -> Float:
@@ -176,7 +176,7 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
     world = truth.take_tracks(is_measured)
     stay = _ego_stay(scene, truth)
     if measure.onset.instant_s is not None:
-        found = _begin_at(measure.onset.instant_s, world, stay)
+        begun = _begin_at(measure.onset.instant_s, world, stay)
     else:
         possible = stay.there[world.frame_ix]
         view = OnsetView(
@@ -185,19 +185,19 @@ def find_episodes(scene: Scene, truth: Tracks, static: Statics, experiment: Metr
             lambda seen_by: _find_best_share(scene, truth, static, experiment, seen_by)[is_measured[truth.track_ix]],
         )
         holding = evaluate_onset(measure.onset, view) & possible
-        found = _begin_holding(world, holding, possible, truth.captured_s, stay, measure.onset.again_after_s)
-    last_s = world.row_captured_s[world.start[found.track + 1] - 1] if len(found.track) else np.empty(0)
+        begun = _begin_holding(world, holding, possible, truth.captured_s, stay, measure.onset.again_after_s)
+    last_s = world.row_captured_s[world.start[begun.track + 1] - 1] if len(begun.track) else np.empty(0)
     ended_s, ended_by = _find_ends(last_s, stay.last_s, scene.end_s)
-    leaves = np.isfinite(found.held_until_s)
-    ended_s = np.where(leaves, found.held_until_s, ended_s)
-    left, ego_left = END_REASONS.index(EndReason.OBJECT_LEFT), END_REASONS.index(EndReason.EGO_LEFT)
-    ended_by = np.where(leaves, np.where(found.ego_left, ego_left, left), ended_by)
-    number = np.arange(len(found.track)) - np.searchsorted(found.track, found.track)
+    leaves = np.isfinite(begun.held_until_s)
+    ended_s = np.where(leaves, begun.held_until_s, ended_s)
+    object_left, ego_left = END_REASONS.index(EndReason.OBJECT_LEFT), END_REASONS.index(EndReason.EGO_LEFT)
+    ended_by = np.where(leaves, np.where(begun.ego_left, ego_left, object_left), ended_by)
+    number = np.arange(len(begun.track)) - np.searchsorted(begun.track, begun.track)
     before_s = np.where(number > 0, np.append(-np.inf, ended_s)[:-1], -np.inf)
-    object_ix = world.object_ix[found.track]
+    object_ix = world.object_ix[begun.track]
     order = np.argsort(object_ix, kind="stable")
     return Episodes(
-        object_ix, number, found.onset_s, found.began, ended_s, ended_by, before_s, found.returns
+        object_ix, number, begun.onset_s, begun.began, ended_s, ended_by, before_s, begun.returns
     ).take(order)  # fmt: skip
 
 
@@ -230,9 +230,9 @@ def _begin_at(instant_s: float, world: Tracks, stay: _EgoStay) -> _Begun:
     if not stay.first_s - SAME_INSTANT_S <= instant_s <= stay.last_s + SAME_INSTANT_S:
         track = track[:0]
     count = len(track)
-    none = np.zeros(count, dtype=np.int64)
+    zeros = np.zeros(count, dtype=np.int64)
     begun = np.full(count, instant_s), np.full(count, CROSSED)
-    return _Begun(track, *begun, np.full(count, np.inf), np.zeros(count, dtype=bool), none)
+    return _Begun(track, *begun, np.full(count, np.inf), np.zeros(count, dtype=bool), zeros)
 
 
 def _begin_holding(
@@ -248,20 +248,20 @@ def _begin_holding(
     returned = out & (away_s > (AGAIN_AFTER_S if again_after_s is None else again_after_s) + SAME_INSTANT_S)
     begins = np.flatnonzero(first | returned if again_after_s is not None else first)
     onset_row, onset_first = rows[begins], first[begins]
-    asked_from_s = frames_s[np.argmax(stay.there)] if stay.there.any() else np.inf
+    possible_from_s = frames_s[np.argmax(stay.there)] if stay.there.any() else np.inf
     earlier, _ = _find_first_true(possible, world.start)
     own_first = earlier[track[begins]] == onset_row
     # Who comes back crosses if it, and the ego, was there up to then, else it appears again.
     followed = (onset_row > 0) & (world.frame_ix[onset_row] - world.frame_ix[onset_row - 1] == 1)
     followed &= possible[onset_row - 1]
     began = np.where(np.where(onset_first, own_first, ~followed), APPEARED, CROSSED)
-    began = np.where(onset_first & own_first & (time_s[begins] <= asked_from_s + SAME_INSTANT_S), LOG_START, began)
+    began = np.where(onset_first & own_first & (time_s[begins] <= possible_from_s + SAME_INSTANT_S), LOG_START, began)
     held_until_s = np.full(len(begins), np.inf)
-    again = np.flatnonzero(~onset_first)
-    held_until_s[again - 1] = time_s[begins[again] - 1]
-    held_row, ego_left = rows[begins[again] - 1], np.zeros(len(begins), dtype=bool)
+    return_ix = np.flatnonzero(~onset_first)
+    held_until_s[return_ix - 1] = time_s[begins[return_ix] - 1]
+    held_row, ego_left = rows[begins[return_ix] - 1], np.zeros(len(begins), dtype=bool)
     stays = world.frame_ix[held_row + 1] - world.frame_ix[held_row] == 1
-    ego_left[again - 1] = stays & ~possible[held_row + 1]
+    ego_left[return_ix - 1] = stays & ~possible[held_row + 1]
     count = np.append(0, np.cumsum(returned & ~np.isin(np.arange(len(rows)), begins)))
     returns = np.diff(count[np.append(begins, len(rows))])
     return _Begun(track[begins], time_s[begins], began, held_until_s, ego_left, returns)
@@ -296,12 +296,12 @@ def _find_first_true(flags: Bool, start: Int) -> tuple[Int, Bool]:
     return np.where(exists, first, start[:-1]), exists
 
 
-def _measure_distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, from_: str) -> Float:
+def _measure_distance(scene: Scene, truth: Tracks, world: Tracks, experiment: MetricsSetup, place: str) -> Float:
     """(P,) distance of each row, infinite where there is nothing to measure from."""
     per_frame = locate_reference(scene, truth, experiment, truth.captured_s)
     f = world.frame_ix
     dx, dy = world.x_m[0] - per_frame.x_m[f], world.y_m[0] - per_frame.y_m[f]
-    if from_ == "front":
+    if place == "front":
         cos, sin = np.cos(per_frame.heading_rad[f]), np.sin(per_frame.heading_rad[f])
         distance = np.abs(dx * cos + dy * sin - per_frame.length_m[f] / 2)
     else:

@@ -46,7 +46,7 @@ class LastingDetection:
     captured_s: Float
 
     def take(self, rows: Int) -> LastingDetection:
-        """The lists of these rows only."""
+        """The lists of these rows."""
         return LastingDetection(self.process[rows], self.share[rows], self.tau_s[rows], self.captured_s[rows])
 
     def log_missed(self, listed: Float, fresh: Float) -> Float:
@@ -226,19 +226,19 @@ def first_known(
         step += _weigh_by_presence(unit_step, presence)
         log_half += float(_weigh_by_presence(half[rows].sum(keepdims=True), presence)[0])
         # The derivative counts only if the unit is there, which is improbable when all its lists have missed.
-        still = float(_posterior_presence(unit_step.sum(keepdims=True), presence)[0][0])
+        p_there = float(_posterior_presence(unit_step.sum(keepdims=True), presence)[0][0])
         if lasts is None:
-            slope -= still * float(listed[rows].sum())
+            slope -= p_there * float(listed[rows].sum())
         else:
             unit_lasts = lasts.take(rows)
-            slope += still * (unit_lasts.slope(listed[rows]) - float(listed[rows][unit_lasts.process < 0].sum()))
+            slope += p_there * (unit_lasts.slope(listed[rows]) - float(listed[rows][unit_lasts.process < 0].sum()))
     unknown = np.cumsum(step)
     probability = np.exp(_shift_by_one(unknown)) * (0.0 - np.expm1(step))
     return _build_first_known(time_s, probability, float(unknown[-1]) if len(unknown) else 0.0, slope, log_half)
 
 
-def first_confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, of: int) -> FirstKnown:
-    """When for the first time `hits` ≥ 2 of the last `of` captures hold the object; lists (P,) as for `first_known`.
+def first_confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, window: int) -> FirstKnown:
+    """When `hits` ≥ 2 of the last `window` captures hold the object for the first time; lists (P,) as in `first_known`.
 
     `instant (P,)`: number of the capture instant of each list. Lists of one instant arrive together, and those of a
     later instant not sooner: several instants may arrive together.
@@ -247,14 +247,14 @@ def first_confirmed(instant: Int, arrives_s: Float, listed: Float, hits: int, of
     number, place = np.unique(instant, return_inverse=True)
     arrival_of = np.zeros(len(number), dtype=np.int64)
     arrival_of[place] = arrival
-    without = np.minimum(np.diff(number, prepend=number[:1]) - 1, of)
+    gaps = np.minimum(np.diff(number, prepend=number[:1]) - 1, window)
     total = _sum_by_instant(place, listed, len(number))
     probability, half = np.zeros(len(number)), np.zeros(len(number))
     log_never, slope = _run_chain(
-        _sum_by_instant(place, _log_missed(listed, 1.0), len(number)), total, without, hits, of, probability
+        _sum_by_instant(place, _log_missed(listed, 1.0), len(number)), total, gaps, hits, window, probability
     )
     log_half, _ = _run_chain(
-        _sum_by_instant(place, _log_missed(listed, _HALF), len(number)), total, without, hits, of, half
+        _sum_by_instant(place, _log_missed(listed, _HALF), len(number)), total, gaps, hits, window, half
     )
     return _build_first_known(time_s, _sum_by_instant(arrival_of, probability, len(time_s)), log_never, slope, log_half)
 
@@ -320,35 +320,37 @@ def _weigh_by_presence(step: Float, share: float) -> Float:
 
 
 @kernel
-def _run_chain(step: Float, listed: Float, without: Int, hits: int, of: int, probability: Float) -> tuple[float, float]:
-    """A Markov chain whose state is which of the last `of` − 1 captures hold the object.
+def _run_chain(
+    step: Float, listed: Float, gaps: Int, hits: int, window: int, probability: Float
+) -> tuple[float, float]:
+    """A Markov chain whose state is which of the last `window` − 1 captures hold the object.
 
     `step (K,)`: ln of the probability that no list of the instant holds it; `listed (K,)`: the sum of their p;
-    `without (K,)`: captures without the object before the instant. Each state has the logarithm of its mass and its
+    `gaps (K,)`: captures without the object before the instant. Each state has the logarithm of its mass and its
     derivative by δ; derivatives that meet in a state are weighted by their masses. Fills `probability (K,)` and returns
     ln P(never) and its derivative.
     """
-    states = 1 << (of - 1)
-    held = np.zeros(states, dtype=np.int64)
+    states = 1 << (window - 1)
+    hits_in = np.zeros(states, dtype=np.int64)
     for state in range(1, states):
-        held[state] = held[state >> 1] + (state & 1)
+        hits_in[state] = hits_in[state >> 1] + (state & 1)
     mass, slope = np.full(states, -np.inf), np.zeros(states)
     mass[0] = 0.0
     known, known_slope = 0.0, 0.0
     for k in range(len(step)):
-        for _ in range(without[k]):
-            mass, slope = _advance_chain(mass, slope, held, of + 1, 0.0, 0.0, -np.inf, 0.0)
+        for _ in range(gaps[k]):
+            mass, slope = _advance_chain(mass, slope, hits_in, window + 1, 0.0, 0.0, -np.inf, 0.0)
         hit, hit_slope = -np.inf, 0.0
         if step[k] < 0:
             hit, hit_slope = np.log(-np.expm1(step[k])), listed[k] / np.expm1(-step[k])
-        done, done_slope = -np.inf, 0.0
+        new, new_slope = -np.inf, 0.0
         for state in range(states):
-            if held[state] + 1 >= hits:
-                done, done_slope = _add_logs(done, done_slope, mass[state] + hit, slope[state] + hit_slope)
-        probability[k] = np.exp(done)
+            if hits_in[state] + 1 >= hits:
+                new, new_slope = _add_logs(new, new_slope, mass[state] + hit, slope[state] + hit_slope)
+        probability[k] = np.exp(new)
         known += probability[k]
-        known_slope += probability[k] * done_slope
-        mass, slope = _advance_chain(mass, slope, held, hits, step[k], -listed[k], hit, hit_slope)
+        known_slope += probability[k] * new_slope
+        mass, slope = _advance_chain(mass, slope, hits_in, hits, step[k], -listed[k], hit, hit_slope)
     if known < 0.5:  # then the rest is near 1, and its logarithm near 0
         return np.log1p(-known), -known_slope / (1 - known)
     rest, rest_slope = -np.inf, 0.0
@@ -359,7 +361,7 @@ def _run_chain(step: Float, listed: Float, without: Int, hits: int, of: int, pro
 
 @callee
 def _advance_chain(
-    mass: Float, slope: Float, held: Int, hits: int, miss: float, miss_slope: float, hit: float, hit_slope: float
+    mass: Float, slope: Float, hits_in: Int, hits: int, miss: float, miss_slope: float, hit: float, hit_slope: float
 ) -> tuple[Float, Float]:
     """The chain one capture on: states that differ in the oldest capture only lead to one state by miss or hit."""
     states = len(mass)
@@ -369,7 +371,7 @@ def _advance_chain(
         new[after], new_slope[after] = _add_logs(
             new[after], new_slope[after], mass[state] + miss, slope[state] + miss_slope
         )
-        if held[state] + 1 < hits:
+        if hits_in[state] + 1 < hits:
             new[after | 1], new_slope[after | 1] = _add_logs(
                 new[after | 1], new_slope[after | 1], mass[state] + hit, slope[state] + hit_slope
             )

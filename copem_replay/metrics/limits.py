@@ -64,9 +64,9 @@ TRAFFIC = ("logs", "objects", "passes")
 
 
 def choose_over(logs: int, objects: int, passes: int) -> str | None:
-    """What an interval is over: `logs`, `objects`, `passes` or `runs`; None: nothing.
+    """The unit an interval is over: `logs`, `objects`, `passes` or `runs`; None: no interval.
 
-    `logs`, `objects`, `passes` (episodes): how many have rows.
+    `logs`, `objects`, `passes` (episodes): how many of each have rows.
     """
     if logs >= FEWEST_LOGS:
         return "logs"
@@ -78,7 +78,7 @@ def choose_over(logs: int, objects: int, passes: int) -> str | None:
 
 
 def count_clusters(table: pd.DataFrame) -> tuple[int, int, int]:
-    """How many logs, objects of them and episodes of these have rows."""
+    """The number of logs, of objects in them and of episodes of these that have rows."""
     keys = [name for name in ("log", "object_id", "episode") if name in table]
     logs, objects, passes = (len(table[keys[:k]].drop_duplicates()) for k in (1, 2, 3))
     return logs, objects, passes
@@ -99,12 +99,12 @@ class Clusters:
 
     @cached_property
     def count(self) -> int:
-        """K."""
+        """The number of clusters, K."""
         return int(self.number.max(initial=-1)) + 1
 
     @cached_property
     def units(self) -> int:
-        """How many objects, or passes, the rows are about; where clusters are runs, how many each looks at."""
+        """The number of objects, or passes, that the rows are about; where clusters are runs, of those in each run."""
         import pandas as pd
 
         return len(pd.unique(self.unit))
@@ -116,7 +116,7 @@ class Clusters:
 
     @cached_property
     def group(self) -> Int:
-        """(n,) the group of each row's cluster that is left out with its neighbours where there are many."""
+        """(n,) the group of each row's cluster: where clusters are many, neighbours are left out together."""
         group: Int = self.grouped[self.number]
         return group
 
@@ -130,16 +130,16 @@ class Clusters:
         """The kind of the limits of a share."""
         return BOUNDED if self.once else EXACT
 
-    def select(self, kept: Bool) -> Clusters:
-        """The clusters of some of the rows, `kept (n,)`."""
-        return replace(self, number=np.unique(self.number[kept], return_inverse=True)[1], unit=self.unit[kept])
+    def select(self, mask: Bool) -> Clusters:
+        """The clusters of some of the rows, `mask (n,)`."""
+        return replace(self, number=np.unique(self.number[mask], return_inverse=True)[1], unit=self.unit[mask])
 
     def weigh(self, weight: Float) -> Float:
         """(K,) sums of `weight (n,)`."""
         return np.bincount(self.number, weight, self.count).astype(float)
 
     def weigh_units(self, weight: Float) -> Float:
-        """(K,) how many units each cluster is worth by the `weight (n,)` of its rows; runs count one each."""
+        """(K,) the number of units in each cluster by the `weight (n,)` of its rows; runs count one each."""
         sums = self.weigh(weight)
         units: Float = sums * (self.count if self.by_run else self.units) / sums.sum()
         return units
@@ -158,9 +158,9 @@ class Clusters:
 
 
 def weigh_rows(table: pd.DataFrame, column: str, weigh: str = OBJECTS) -> Float:
-    """(n,) how much each row counts: its runs, or its probability, by the `column`.
+    """(n,) the weight of each row: its number of runs, or its probability, by the `column`.
 
-    `weigh`: `drives`: each log counts as much as another, all together as much as before.
+    `weigh`: `drives`: all logs weigh the same; the sum of weights stays.
     """
     import pandas as pd
 
@@ -173,7 +173,7 @@ def weigh_rows(table: pd.DataFrame, column: str, weigh: str = OBJECTS) -> Float:
 
 
 def find_clusters(table: pd.DataFrame, *, of_runs: bool = False, weigh: str = OBJECTS) -> Clusters | None:
-    """What an interval of a table's rows (n,) is over, as by `choose_over`; None: nothing.
+    """The clusters of a table's rows (n,), by `choose_over`; None: there is no interval.
 
     `of_runs`: it is over runs. Rows of a tally stand for several runs: they then form one cluster. `weigh`: as for
     `weigh_rows`.
@@ -184,17 +184,17 @@ def find_clusters(table: pd.DataFrame, *, of_runs: bool = False, weigh: str = OB
     name, names = pd.factorize(table["object_id"].astype(str), sort=True)
     unit, units = pd.factorize(log * max(len(names), 1) + name, sort=True)
     episode, episodes = pd.factorize(table["episode"].to_numpy() if "episode" in table else np.zeros(len(table), int))
-    one, passes = pd.factorize(unit * max(len(episodes), 1) + episode)
+    pass_ix, passes = pd.factorize(unit * max(len(episodes), 1) + episode)
     over = "runs" if of_runs else choose_over(len(logs), len(units), len(passes))
     if over is None:
         return None
     run: Any = pd.factorize(table["run"], sort=True)[0] if "run" in table else np.zeros(len(table), dtype=np.int64)
-    number = {"logs": log, "objects": unit, "passes": one, "runs": run}[over]
-    return Clusters(over, number, one if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
+    number = {"logs": log, "objects": unit, "passes": pass_ix, "runs": run}[over]
+    return Clusters(over, number, pass_ix if over in ("passes", "runs") else unit, over == "logs" and weigh == DRIVES)
 
 
 def describe_clusters(over: str, number: int | None = None, fewest: int | None = None, driving: bool = False) -> str:
-    """What an interval is over, and what it tells: `8 logs: how far other drives of this kind may differ`.
+    """What the interval is over and what it shows: `8 logs: how far other drives of this kind may differ`.
 
     `fewest`: where intervals are over different numbers of clusters, up to `number`. `driving`: of the ego's
     driving, not of objects.
@@ -210,14 +210,14 @@ NOT_ENOUGH = "neither more runs nor objects of several logs together tell how ot
 
 
 def explain_no_clusters(logs: int, objects: int, *_: int) -> str:
-    """Why there is no interval, where `choose_over` says so: `2 logs, fewer than 3`."""
+    """The reason why `choose_over` allows no interval: `2 logs, fewer than 3`."""
     if logs == 1:
         return f"{count_noun(objects, 'object')} of one drive, fewer than {FEWEST_CLUSTERS}"
     return f"{count_noun(logs, 'log')}, fewer than {FEWEST_LOGS}"
 
 
 def describe_absent(logs: int) -> str:
-    """What so many logs cannot exclude, at 95 %, whatever the interval: a kind of drive that none is, 1 − .05^(1/K)."""
+    """The share of drives of a kind that K logs cannot exclude at 95 % when none is of that kind: 1 − .05^(1/K)."""
     share = 1.0 - (1.0 - CONFIDENCE) ** (1.0 / logs)
     return f"a kind of drive that makes up to {100 * share:.0f} % of such traffic can be absent"
 
@@ -238,11 +238,11 @@ def exact_limits(successes: float | Float, n: float | Float, confidence: float =
 
     tail = (1.0 - confidence) / 2
     k, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(n, dtype=float))
-    none, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
+    is_zero, all_of_them = k <= _ROUNDING, n - k <= _ROUNDING
     failures = np.where(all_of_them, 0.0, n - k)
-    low = betaincinv(np.where(none, 1.0, k), failures + 1.0, tail)
-    high = betaincinv(np.where(none, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - tail)
-    return np.where(none, 0.0, low), np.where(all_of_them, 1.0, high)
+    low = betaincinv(np.where(is_zero, 1.0, k), failures + 1.0, tail)
+    high = betaincinv(np.where(is_zero, 0.0, k) + 1.0, np.where(all_of_them, 1.0, failures), 1.0 - tail)
+    return np.where(is_zero, 0.0, low), np.where(all_of_them, 1.0, high)
 
 
 def limit_share(
@@ -302,7 +302,7 @@ def share_variance(residual: Float, weights: Float) -> Float:
 def spread_share(
     share: Float, variance: Float, weights: Float, confidence: float = CONFIDENCE, within: float | Float = WITHIN_LOG
 ) -> tuple[Float, Float]:
-    """Exact limits (…) of a share with a variance (…) over clusters that have so many objects each, `weights (…, K)`.
+    """Exact limits (…) of a share whose variance (…) is over clusters with `weights (…, K)` objects.
 
     Of n objects, m = Σw²/Σw in an average object's cluster, at most n/(1 + `within`·(m − 1)) count, `within` being the
     correlation in a cluster that its number cannot refute; nor more than p(1 − p)/variance, times
@@ -315,15 +315,15 @@ def spread_share(
     n, clusters = weights.sum(axis=-1), (weights > 0).sum(axis=-1)
     counted = n / (1.0 + within * ((weights**2).sum(axis=-1) / n - 1.0))
     spread = share * (1.0 - share)
-    told = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
-    ratio = stdtrit(np.where(told, n - 1.0, 1.0), tail) / stdtrit(np.where(told, clusters - 1.0, 1.0), tail)
-    by_spread = np.where(told, spread / np.where(told, variance, 1.0) * ratio**2, np.inf)
+    varies = (variance > 0) & (spread > _ROUNDING**2) & (clusters > 1)
+    ratio = stdtrit(np.where(varies, n - 1.0, 1.0), tail) / stdtrit(np.where(varies, clusters - 1.0, 1.0), tail)
+    by_spread = np.where(varies, spread / np.where(varies, variance, 1.0) * ratio**2, np.inf)
     effective = np.maximum(np.minimum(counted, by_spread), 1.0)
     return exact_limits(np.clip(share, 0.0, 1.0) * effective, effective, confidence)
 
 
 def alike_limits(difference: float, weights: Float, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Bound a difference of two shares, −1 … 1, that all clusters have alike: (low, high). `weights (K,)`: objects.
+    """Bound a difference of two shares, −1 … 1, that is the same in all clusters: (low, high). `weights (K,)`: objects.
 
     Exact on each side, with n as in `spread_share` without a variance: as if |difference| · n of n objects favoured the
     one and the rest neither; of the rest, any share that is possible where none of n does may favour the other. Five
@@ -382,16 +382,16 @@ def figure_variance(value: Float, without: Float, weights: Float) -> tuple[Float
     samples", Survey Methodology 28 (2002) 169–181, whose formula for a mean this is, with a jackknife's residuals.
     """
     u = weights / weights.sum(axis=-1, keepdims=True)
-    rest = np.where(u < 1.0, 1.0 - u, 1.0)
+    rest_share = np.where(u < 1.0, 1.0 - u, 1.0)
     error = np.where(u > 0, (1.0 - u) * (value[..., None] - without), 0.0)
     squares = (u**2).sum(axis=-1)[..., None, None]
     crossed = u[..., :, None] * u[..., None, :]
     Q = crossed * (squares - u[..., :, None] - u[..., None, :])
     place = np.arange(u.shape[-1])
     Q[..., place, place] += u**2
-    Q /= np.sqrt(rest[..., :, None] * rest[..., None, :])
+    Q /= np.sqrt(rest_share[..., :, None] * rest_share[..., None, :])
     trace = np.trace(Q, axis1=-2, axis2=-1)
-    return (error**2 / rest).sum(axis=-1), trace**2 / (Q**2).sum(axis=(-2, -1))
+    return (error**2 / rest_share).sum(axis=-1), trace**2 / (Q**2).sum(axis=(-2, -1))
 
 
 def limit_figure(
@@ -417,7 +417,7 @@ def limit_figure(
 def alike_run_limits(
     value: float, bounds: tuple[float, float], runs: int, confidence: float = CONFIDENCE
 ) -> tuple[float | Float, float | Float]:
-    """Bound a mean between `bounds` that is the same in so many independent runs: (low, high).
+    """Bound a mean between `bounds` that is the same in all of `runs` independent runs: (low, high).
 
     In a share of runs at most, by exact limits of none of them, it is another, as far as the bounds allow.
     """
@@ -476,7 +476,7 @@ def _weighted_at_random(points: Float, weights: Float, edge: Float, added: Float
 
 @dataclass(frozen=True)
 class LimitedFigure:
-    """A figure with its limits, and the `kind` of these or why there are none; `value` None: there is no row.
+    """A figure with its limits and their `kind`, or the reason why it has none; `value` None: there is no row.
 
     Of a time the value may be ∞, never, of a distance −∞; a limit that is infinite says that there is none.
     `share`: of a quantile, the share on the good side of the bound it is held against, between its limits. `bounds`,
@@ -512,8 +512,8 @@ def limit_left_out(
     if unseen is not None:
         low, high = limit_bounded_mean(value, without, weights, bounds, 1.0, confidence, unseen)
         share = weights / weights.sum()
-        apart = np.where(share > 0, (1.0 / np.where(share > 0, share, 1.0) - 1.0) * (value - without), 0.0)
-        spread = math.sqrt(float(share @ apart**2) * len(share) / (len(share) - 1))
+        deviation = np.where(share > 0, (1.0 / np.where(share > 0, share, 1.0) - 1.0) * (value - without), 0.0)
+        spread = math.sqrt(float(share @ deviation**2) * len(share) / (len(share) - 1))
         return LimitedFigure(value, float(low), float(high), BOUNDED, bounds=bounds, spread=spread)
     if np.abs(without - value).max() > _ROUNDING:
         limits, kind = limit_figure(value, without, weights, bounds, confidence), JACKKNIFE
@@ -593,7 +593,7 @@ NOTHING_DRAWN = "nothing drawn"
 
 
 def interval_words(kind: str, over: str, number: int | None = None) -> str:
-    """What limits are, by the columns `interval` and `interval_over`: `over 8 logs: how far …`."""
+    """The columns `interval` and `interval_over` in words: `over 8 logs: how far …`."""
     method = {
         EXACT: "exact binomial limits", JACKKNIFE: "Student's t", INVERTED: "of medians",
         BOUNDED: "one that was not seen added at the far end",
@@ -611,5 +611,5 @@ def format_limit(value: float) -> str:
 
 
 def format_limits(low: float, high: float) -> str:
-    """An interval as it is written everywhere: `[0.052, 4.39]`; a dash on a side without a limit."""
+    """An interval in the one notation of tables and texts: `[0.052, 4.39]`; a dash on a side without a limit."""
     return f"[{format_limit(low)}, {format_limit(high)}]"

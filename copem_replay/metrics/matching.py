@@ -45,7 +45,7 @@ _TOLERANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class Matches:
-    """What each entry of `ObjectLists` is about. All (N,)."""
+    """The true object that each entry of `ObjectLists` is about. All (N,)."""
 
     object_ix: Int  # the object it is about, −1: none
     role: NDArray[np.int8]  # MATCH, DUPLICATE or GHOST
@@ -57,7 +57,7 @@ class Matches:
 def match_entries(
     lists: ObjectLists, world: Tracks, scene: Scene, origins: Origins, *, gate_m: float, tells_of: TellsOf = "now"
 ) -> Matches:
-    """What the entries of K lists in S runs are about, at the instants they tell of.
+    """Match the entries of K lists in S runs with true objects, at the instants the entries tell of.
 
     `world`: the truth. Where entries tell of `now` its frame k is at the instant list k is available, where they tell
     of their `capture` frames are ascending, at all captures that these entries name, at least.
@@ -73,16 +73,16 @@ def match_entries(
 def match_at_both_times(
     lists: ObjectLists, then: Tracks, now: Tracks, scene: Scene, origins: Origins, *, gate_m: float
 ) -> tuple[Matches, Matches]:
-    """What entries that tell of their `capture` are about; and what they would be about if they told of `now`.
+    """Matches of entries that tell of their `capture`, at the capture and as if they told of `now`.
 
     `then`, `now`: the truth, as `match_entries` takes it for `capture` and for `now`.
     """
-    about = _allocate_matches(lists)
-    at_once = _allocate_matches(lists)._replace(class_ix=about.class_ix)
+    matches = _allocate_matches(lists)
+    at_once = _allocate_matches(lists)._replace(class_ix=matches.class_ix)
     rows = _sort_truth_rows(then, scene, by_frame=False), _sort_truth_rows(now, scene, by_frame=True)
     scratch = _make_scratch(lists)
-    _match_lists(lists.start, lists.entries, origins, *rows, AGREE, gate_m + _TOLERANCE_M, about, at_once, scratch)
-    return Matches(*about), Matches(*at_once)
+    _match_lists(lists.start, lists.entries, origins, *rows, AGREE, gate_m + _TOLERANCE_M, matches, at_once, scratch)
+    return Matches(*matches), Matches(*at_once)
 
 
 def _make_scratch(lists: ObjectLists) -> Int:
@@ -136,22 +136,22 @@ def most_probable_entry_class(entries: Entries, i: int) -> int:
 @borrowing_kernel
 def _match_lists(
     start: Int, entries: Entries, origins: Origins, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
-    about: _MatchColumns, at_once: _MatchColumns, scratch: Int,
+    matches: _MatchColumns, at_once: _MatchColumns, scratch: Int,
 ) -> None:  # fmt: skip
     # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
     # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
-    frame, others = scratch[0], scratch[1]
-    both = rows.by_frame != now.by_frame
+    frame, contested = scratch[0], scratch[1]
+    has_second = rows.by_frame != now.by_frame
     for s in range(len(start)):
         for k in range(start.shape[1] - 1):
             first, n = start[s, k], start[s, k + 1] - start[s, k]
             for i in range(first, first + n):
-                about.class_ix[i] = most_probable_class(entries[i].class_probability)
+                matches.class_ix[i] = most_probable_class(entries[i].class_probability)
             frame[:n] = k
             if not rows.by_frame:
                 _find_frames(entries, first, rows.frame_s, frame[:n])
-            _match_list(entries, origins, (s, k), first, frame[:n], others, rows, agree, gate_m, about)
-            if not both:
+            _match_list(entries, origins, (s, k), first, frame[:n], contested, rows, agree, gate_m, matches)
+            if not has_second:
                 continue
             # At one instant the truths may differ: a clock that is fast tells of an object that has left.
             objects, late = now.bounds[k + 1] - now.bounds[k], False
@@ -159,11 +159,11 @@ def _match_lists(
                 late |= f < 0 or rows.frame_s[f] != now.frame_s[k] or rows.bounds[f + 1] - rows.bounds[f] != objects
             if late:
                 frame[:n] = k
-                _match_list(entries, origins, (s, k), first, frame[:n], others, now, agree, gate_m, at_once)
+                _match_list(entries, origins, (s, k), first, frame[:n], contested, now, agree, gate_m, at_once)
             else:
                 for i in range(first, first + n):
-                    at_once.object_ix[i], at_once.role[i] = about.object_ix[i], about.role[i]
-                    at_once.x_m[i], at_once.y_m[i] = about.x_m[i], about.y_m[i]
+                    at_once.object_ix[i], at_once.role[i] = matches.object_ix[i], matches.role[i]
+                    at_once.x_m[i], at_once.y_m[i] = matches.x_m[i], matches.y_m[i]
 
 
 @borrowing
@@ -183,10 +183,10 @@ def _find_frames(entries: Entries, first: int, frame_s: Float, out: Int) -> None
 def _match_list(
     entries: Entries,
     origins: Origins,
-    which: tuple[int, int],
+    list_key: tuple[int, int],
     first: int,
     frame: Int,
-    others: Int,
+    contested: Int,
     rows: _TruthRows,
     agree: Bool,
     gate_m: float,
@@ -196,23 +196,23 @@ def _match_list(
     row_x_m, row_y_m = rows.x_m, rows.y_m
     object_ix, role, class_ix, match_of = out.object_ix, out.role, out.class_ix, rows.match_of
     n = 0
-    for again in range(2):
+    for second_pass in range(2):
         # At first all entries, then those at an object whose match is another entry: most of these have no other
         # object near, and only those that have one are sorted.
         for j in range(len(frame)):
             i = first + j
-            if again and (role[i] != DUPLICATE or _are_at_one_place(entries, i, match_of[object_ix[i]])):
+            if second_pass and (role[i] != DUPLICATE or _are_at_one_place(entries, i, match_of[object_ix[i]])):
                 continue
             p = -1
             if frame[j] >= 0:
                 p = _find_nearest(
                     entries[i].x_m, entries[i].y_m, class_ix[i], bounds[frame[j]], bounds[frame[j] + 1], gate_m, agree,
-                    row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, again == 1, origins, which, i,
+                    row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, second_pass == 1, origins, list_key, i,
                 )  # fmt: skip
             if p < 0:
                 continue
-            if again:
-                others[n] = i
+            if second_pass:
+                contested[n] = i
                 n += 1
                 continue
             o = row_object_ix[p]
@@ -222,15 +222,15 @@ def _match_list(
     for i in range(first, first + len(frame)):
         if role[i] == DUPLICATE and match_of[object_ix[i]] == i:
             role[i] = MATCH
-    _sort_by_preference(entries, others, n)
+    _sort_by_preference(entries, contested, n)
     for j in range(n):
-        i = others[j]
+        i = contested[j]
         f = frame[i - first]
         p = _find_nearest(
             entries[i].x_m, entries[i].y_m, class_ix[i], bounds[f], bounds[f + 1], gate_m, agree,
-            row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True, origins, which, i,
+            row_object_ix, row_class_ix, row_x_m, row_y_m, match_of, True, origins, list_key, i,
         )  # fmt: skip
-        original = _find_original(entries, i, others[:j])
+        original = _find_original(entries, i, contested[:j])
         if original >= 0:
             if entries[original].captured_s == entries[i].captured_s and class_ix[original] == class_ix[i]:
                 object_ix[i], out.x_m[i], out.y_m[i] = object_ix[original], out.x_m[original], out.y_m[original]
@@ -247,17 +247,17 @@ def _match_list(
 def _find_nearest(
     x: float, y: float, entry_class_ix: int, first: int, high: int, gate_m: float, agree: Bool, object_ix: Int,
     class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool, origins: Origins,
-    which: tuple[int, int], i: int,
+    list_key: tuple[int, int], i: int,
 ) -> int:  # fmt: skip
     # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western), of a class that
     # agrees with the entry's and of an object that entry i of the list of a run may be about; −1: none.
     least, best, west_m = gate_m * gate_m, -1, x - gate_m
-    left = high - first
-    while left > 0:  # the first row that is not too far west; without branches, which cannot be predicted
-        half = left >> 1
+    remaining = high - first
+    while remaining > 0:  # the first row that is not too far west; without branches, which cannot be predicted
+        half = remaining >> 1
         too_far = x_m[first + half] < west_m
         first = first + half + 1 if too_far else first
-        left = left - half - 1 if too_far else half
+        remaining = remaining - half - 1 if too_far else half
     for p in range(first, high):
         if x_m[p] > x + gate_m:
             break
@@ -265,7 +265,7 @@ def _find_nearest(
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
         nearer = square < least or (square == least and best < 0)
-        if nearer and may_be_about(origins, which[0], which[1], i, object_ix[p]):
+        if nearer and may_be_about(origins, list_key[0], list_key[1], i, object_ix[p]):
             least, best = square, p
     return best
 

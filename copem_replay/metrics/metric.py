@@ -97,7 +97,7 @@ class Metric:
 
 
 def compared_metric(name: str, better: Literal[-1, 1], part: str, header: str, compared: Compared) -> Metric:
-    """A metric that `compare` alone has: it is of pairs."""
+    """A metric of pairs, which `compare` alone has."""
     return Metric(name, lambda _: None, lambda _: None, better, "", part, header, compared)
 
 
@@ -121,7 +121,7 @@ def _pin_limits(metrics: Sequence[Metric], row: Mapping[str, Value]) -> dict[str
 
 
 def divide_or_none(total: float, number: float) -> float | None:
-    """A mean, or a share; None: of nothing."""
+    """The quotient, a mean or a share; None where the divisor is 0."""
     return float(total) / float(number) if number > 0 else None
 
 
@@ -164,12 +164,12 @@ def own_metrics(components: Sequence[RowMetric]) -> tuple[Metric, ...]:
     return tuple(_own_metric_column(k, component) for k, component in enumerate(components))
 
 
-def _own_metric_column(k: int, own: RowMetric) -> Metric:
+def _own_metric_column(k: int, metric: RowMetric) -> Metric:
     def value(sums: OwnSums) -> float | None:
-        number = ask_component(own, _own_metric_key(k), lambda: _check_number(own.value(sums))) if sums else None
+        number = ask_component(metric, _own_metric_key(k), lambda: _check_number(metric.value(sums))) if sums else None
         return None if number is None or np.isnan(number) else number
 
-    return Metric(own.name, lambda given: given.own.get(own.name, {}), value, own.better, own.help, OWN)
+    return Metric(metric.name, lambda given: given.own.get(metric.name, {}), value, metric.better, metric.help, OWN)
 
 
 def _own_metric_key(k: int) -> str:
@@ -206,12 +206,12 @@ def own_statistics(components: Sequence[RowMetric], rows: pd.DataFrame) -> dict[
     }
 
 
-def _check_statistics(own: RowMetric, rows: pd.DataFrame) -> dict[str, Float]:
+def _check_statistics(metric: RowMetric, rows: pd.DataFrame) -> dict[str, Float]:
     columns: dict[str, Float] = {}
-    for name, values in own.statistics(rows).items():
+    for name, values in metric.statistics(rows).items():
         columns[name] = np.asarray(values, dtype=float)
-        if (found := columns[name].shape) != (len(rows),):
-            raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {found}")
+        if (shape := columns[name].shape) != (len(rows),):
+            raise GivenError("statistics", f"{name}: expected shape ({len(rows)},), found {shape}")
     return columns
 
 
@@ -246,14 +246,14 @@ class LinkTimes:
         return float(np.interp(q * passed[-1], passed, ages[order])) if len(ages) and passed[-1] > 0 else None
 
 
-def link_times(seen: Tracks, arriving: Tracks, received: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
+def link_times(listed: Tracks, arriving: Tracks, received: Tracks, units: Collection[str], end_s: float) -> LinkTimes:
     """Sums over the lists that `units` send in one run, up to the end of the log, `end_s`.
 
-    `seen`: the lists as they are sent; `arriving`: as they arrive, which decides whether they are overtaken;
+    `listed`: the lists as they are sent; `arriving`: as they arrive, which decides whether they are overtaken;
     `received`: as the receiver takes them in.
     """
     arrives_s, late = received.common_arrives_s, find_out_of_sequence(received)
-    sent = np.isfinite(seen.common_arrives_s)
+    sent = np.isfinite(listed.common_arrives_s)
     sent &= np.array([name in units for name in received.units], dtype=bool)[received.frame_unit_ix]
     arrived = sent & np.isfinite(arrives_s)
     ages: list[tuple[Float, Float]] = []

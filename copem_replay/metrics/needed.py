@@ -1,4 +1,4 @@
-"""How many logs, objects, passes or runs would decide what so few leave open, if more are like those at hand.
+"""How many logs, objects, passes or runs would decide a criterion that stays undecided, if further ones are alike.
 
 Numbers are rough: with as many, four of five studies show it. They were simulated in .72 to 1.0 of cases.
 """
@@ -22,7 +22,7 @@ _SAME = 1e-9
 
 
 def count_for_share(share: float, bound: float, confidence: float = CONFIDENCE) -> float:
-    """How many independent objects show on which side of `bound` a share is; infinite: it is at the bound.
+    """Independent objects needed to show on which side of `bound` a share is; infinite: it is at the bound.
 
     Without a single one on the other side: ln τ / ln B, exact; else by the normal approximation of exact limits.
     """
@@ -44,7 +44,7 @@ def count_for_share(share: float, bound: float, confidence: float = CONFIDENCE) 
 def count_for_mean(
     value: float, bound: float, bounds: tuple[float, float], spread: float, confidence: float = CONFIDENCE
 ) -> float:
-    """How many clusters, of which means vary by `spread`, show on which side of `bound` a mean between `bounds` is."""
+    """Clusters needed to show on which side of `bound` a mean between `bounds` is; `spread`: of the clusters' means."""
     gap, reach = abs(bound - value), (bounds[1] - value if value < bound else value - bounds[0])
     (z, power), tail = _quantiles(confidence), (1.0 - confidence) / 2
 
@@ -64,13 +64,13 @@ def count_for_mean(
 def count_for_figure(
     value: float, bound: float, half_width: float, clusters: int, confidence: float = CONFIDENCE
 ) -> float:
-    """How many clusters show on which side of `bound` a figure is, which so many know to ± `half_width`."""
+    """Clusters needed to show on which side of `bound` a figure is, if so many `clusters` know it to ± `half_width`."""
     gap, (z, power) = abs(bound - value), _quantiles(confidence)
     return clusters * ((z + power) / z * half_width / gap) ** 2 if gap > _SAME else math.inf
 
 
 def find_spread(low: float, high: float, clusters: int, confidence: float = CONFIDENCE) -> float:
-    """The standard deviation of the clusters of which Student's t gives such limits."""
+    """The standard deviation of the clusters for which Student's t gives these limits."""
     from scipy.special import stdtrit
 
     return float((high - low) / 2 * math.sqrt(clusters) / -stdtrit(clusters - 1, (1.0 - confidence) / 2))
@@ -89,13 +89,13 @@ LEVELS = {"p5": 0.05, "median": 0.5, "p95": 0.95}
 
 
 def find_level(metric: str) -> float | None:
-    """The share that is on the good side of the bound if a quantile is; None: the metric is none."""
+    """The share of rows on the good side of the bound that a quantile metric requires; None: no quantile."""
     level = next((LEVELS[part] for part in metric.split("_") if part in LEVELS), None)
     return level if level is None or "dad" not in metric else 1.0 - level
 
 
 class Known(NamedTuple):
-    """What an interval is over: `clusters` of `over`, about so many `units`."""
+    """The size of an interval's sample: `clusters` of `over`, about `units` units."""
 
     over: str
     clusters: int
@@ -111,26 +111,26 @@ def count_deciding(
     *,
     paired: bool = False,
 ) -> int | None:
-    """How many of what its interval is over would decide a figure; None: no number, the figure is at its bound.
+    """The number of clusters that would decide a figure; None: no number would, as the figure is at its bound.
 
-    `paired`: it is a difference.
+    `paired`: the figure is a difference.
     """
     value = figure.value if figure.value is not None else math.nan
     level = find_level(metric)
     if figure.share is not None and level is not None:
-        found = count_in_logs(count_for_share(figure.share[1], level, confidence), known)
+        count = count_in_logs(count_for_share(figure.share[1], level, confidence), known)
     elif figure.bounds is not None and not math.isnan(figure.spread):
-        found = count_for_mean(value, bound, figure.bounds, figure.spread, confidence)
+        count = count_for_mean(value, bound, figure.bounds, figure.spread, confidence)
     elif "share" in metric and not paired:
-        found = count_in_logs(count_for_share(value, bound, confidence), known)
+        count = count_in_logs(count_for_share(value, bound, confidence), known)
     else:
         half = (figure.high - figure.low) / 2
-        found = count_for_figure(value, bound, half, known.clusters, confidence)
-    return None if math.isnan(found) or found > _MOST else math.ceil(round(found, 6))
+        count = count_for_figure(value, bound, half, known.clusters, confidence)
+    return None if math.isnan(count) or count > _MOST else math.ceil(round(count, 6))
 
 
 def count_in_logs(objects: float, known: Known) -> float:
-    """How many clusters have as much to tell of a share as so many independent objects."""
+    """The number of clusters that say as much about a share as `objects` independent objects."""
     if known.over != "logs":
         return objects
     of_each = max(known.units / known.clusters, 1.0)
@@ -143,17 +143,17 @@ _TO_HORIZON = ("ttd_rmst_s", "unknown_to_horizon_s", "conflict_ttd_rmst_s")
 def count_at_best(
     metric: str, direction: str, bound: float, horizon_s: float, known: Known, confidence: float = CONFIDENCE
 ) -> int | None:
-    """The fewest that can meet a criterion, all being as good as possible; None: as many as there are, or unknown."""
+    """The least number that can meet a criterion if all rows are as good as possible; None: no more, or unknown."""
     level = find_level(metric)
     if level is not None:
-        found = count_in_logs(count_for_share(1.0, level, confidence), known)
+        count = count_in_logs(count_for_share(1.0, level, confidence), known)
     elif "share" in metric:
-        found = count_in_logs(count_for_share(float(direction == "at_least"), bound, confidence), known)
+        count = count_in_logs(count_for_share(float(direction == "at_least"), bound, confidence), known)
     elif metric.removesuffix("_exact") in _TO_HORIZON and direction == "at_most" and bound > 0:
-        found = count_for_mean(0.0, bound, (0.0, horizon_s), 0.0, confidence)
+        count = count_for_mean(0.0, bound, (0.0, horizon_s), 0.0, confidence)
     else:
         return None
-    return None if found <= known.clusters or math.isinf(found) else math.ceil(round(found, 6))
+    return None if count <= known.clusters or math.isinf(count) else math.ceil(round(count, 6))
 
 
 def find_enough_horizon(metric: str, bound: float, known: Known, confidence: float = CONFIDENCE) -> float | None:

@@ -54,13 +54,13 @@ COUNTS_BY = ("began", "onset_s", "ended_s")
 
 
 def has_frame_after(rows: pd.DataFrame) -> Bool:
-    """(n,) whether the object is followed beyond its onset: of an episode of one frame nothing can be told."""
+    """(n,) whether the object has a frame after its onset: nothing can be measured of an episode of one frame."""
     after: Bool = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float) > SAME_INSTANT_S
     return after
 
 
 def is_counted(rows: pd.DataFrame, words: Sequence[str]) -> Bool:
-    """(n,) whether rows count for times, shares and distances at detection. Everything else is measured of all rows.
+    """Mask (n,) of the rows that count for times, shares and distances at detection; all else is measured of all rows.
 
     They began in one of the ways `words` (`measure.began`), and have a frame after the onset. `rows`: a table with the
     columns `COUNTS_BY`.
@@ -82,12 +82,12 @@ COUNT_ALL = "measure: {began: [log_start, crossed, appeared]}"
 
 
 def count_counted(numbers: Sequence[int], words: Sequence[str]) -> int:
-    """How many of the episodes count by `measure.began`."""
+    """The number of episodes that count by `measure.began`."""
     return sum(number for word, number in zip(BEGAN, numbers, strict=True) if word in words)
 
 
 def describe_numbers(numbers: Sequence[int]) -> str:
-    """`5 log_start, 2 appeared, 9 crossed`."""
+    """The numbers of episodes by how they began: `5 log_start, 2 appeared, 9 crossed`."""
     return ", ".join(f"{number} {word}" for word, number in zip(BEGAN, numbers, strict=True))
 
 

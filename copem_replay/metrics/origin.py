@@ -32,7 +32,7 @@ from copem_replay.core.tracks import SAME_INSTANT_S, Bool, Float, Int, Tracks
 
 
 class GoesBack(IntEnum):
-    """To which lists an entry goes back: of each unit to the newest, to all taken in, or this is not known."""
+    """The lists that an entry goes back to: of each unit the newest, all that were taken in, or unknown."""
 
     TO_NEWEST = 0
     TO_ALL = 1
@@ -55,7 +55,7 @@ class OriginLists:
     own_body_ix: int
 
     def find_holdings(self, issue_s: Float) -> Holdings:
-        """What these lists hold, for fused lists that are available at `issue_s (K,)`."""
+        """The objects that these lists hold, for fused lists available at `issue_s (K,)`."""
         lists, arrives_s = self.lists, self.lists.common_arrives_s
         way_s = find_longest_way_s(lists)
         # Those before the first row, in a time chunk, hold nobody; where nothing is known of origin, each counts.
@@ -100,7 +100,7 @@ def find_earliest_origin_s(lists: Tracks, captured_s: Float, max_age_s: float, p
 
 
 class Holdings(NamedTuple):
-    """Which objects lists (A,) hold, unit by unit in order of capture; fused lists (K,), rows (P,) as `by_object`."""
+    """The objects in lists (A,), unit by unit in order of capture; fused lists (K,), rows (P,) as `by_object`."""
 
     goes_back: int
     partial: Bool  # (U,)
@@ -165,10 +165,10 @@ def _holds(h: Holdings, s: int, a: int, o: int, not_before_s: float) -> bool:
 
 @borrowing
 def find_holding_lists(origins: Origins, s: int, k: int, i: int, o: int, not_before_s: float, any_will_do: bool) -> int:
-    """How many lists that entry i of fused list k in run s goes back to hold object o: the first of `h.holding`.
+    """Find the lists that entry i of fused list k in run s goes back to and that hold object o; returns their number.
 
-    Of each unit the newest; of an entry with a truth id all. Those captured before `not_before_s` do not count.
-    `any_will_do`: one is enough.
+    Out: the first of `h.holding`. Of each unit the newest list counts, of an entry with a truth id all; none captured
+    before `not_before_s`. `any_will_do`: stop at the first.
     """
     h, entry, n = origins.holdings, origins.entries[i], 0
     known, bounded = len(origins.own_ix) > 0, h.goes_back == GoesBack.TO_NEWEST

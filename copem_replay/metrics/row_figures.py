@@ -53,7 +53,7 @@ _SAME = 1e-9
 
 
 def detection_endings(rows: pd.DataFrame) -> tuple[Float, Int]:
-    """Time (n,) from onset to detection or end of the episode, and kind of ending (n,).
+    """The time (n,) from onset to detection or end of the episode, and the kind of ending (n,).
 
     `rows`: of `Results.known`, or of the tally.
     """
@@ -83,7 +83,7 @@ class FigureRows:
 
     @cached_property
     def known(self) -> Bool:
-        """(n,) whether a row is for an instant, not for never."""
+        """(n,) whether the object is ever known: the row has an instant, not never."""
         known: Bool = self.table["time_to_detection_s"].notna().to_numpy(dtype=bool)
         return known
 
@@ -95,22 +95,22 @@ class FigureRows:
 
     @property
     def unknown_s(self) -> Float:
-        """(n,) seconds unknown."""
+        """(n,) seconds for which the object is unknown."""
         return compute_unknown_s(self.table["time_to_detection_s"].to_numpy(dtype=float), self.length_s)
 
     @cached_property
     def endings(self) -> tuple[Float, Int]:
-        """(n,) times, and how they end."""
+        """(n,) times of endings and (n,) their kinds, by `detection_endings`."""
         time_s, ending = detection_endings(self.table)
         return np.round(time_s, 9), ending
 
     @cached_property
     def curve(self) -> tuple[Float, Float]:
-        """The cumulative incidence: its times and values."""
+        """The cumulative incidence: its times and its values."""
         return cumulative_incidence(*self.endings, self.weight, least=self.least)
 
     def limit_share(self, successes: Float, confidence: float) -> LimitedFigure:
-        """The share of `successes (n,)`, weights of rows or parts of them."""
+        """The share of the weight that `successes (n,)` have, with limits."""
         value = float(successes.sum()) / float(self.weight.sum())
         if self.clusters is None:
             return LimitedFigure(value)
@@ -119,32 +119,32 @@ class FigureRows:
 
     def limit_mean_time(self, horizon_s: float, confidence: float) -> LimitedFigure:
         """The restricted mean; without limits where no row is followed to its detection, departure or the horizon."""
-        value, of = restricted_mean(*self.curve, horizon_s), self.clusters
+        value, over = restricted_mean(*self.curve, horizon_s), self.clusters
         time_s, ending = self.endings
         followed = float(self.weight[(ending != CENSORED) | (time_s >= horizon_s - _SAME)].sum() / self.weight.sum())
-        if of is None or not followed:
+        if over is None or not followed:
             return LimitedFigure(value)
-        groups = int(of.group.max()) + 1
+        groups = int(over.group.max()) + 1
         bounds = float(time_s[self.known].min(initial=min(self.least_s, horizon_s))), horizon_s
         without = restricted_means_without(
-            time_s, ending, self.weight, of.group, groups, horizon_s, least=self.least
+            time_s, ending, self.weight, over.group, groups, horizon_s, least=self.least
         )  # fmt: skip
-        return self._limit_mean(of, value, without, bounds, confidence, followed)
+        return self._limit_mean(over, value, without, bounds, confidence, followed)
 
     def limit_mean(self, values: Float, most: float, confidence: float) -> LimitedFigure:
-        """The mean of values (n,), from 0 to `most`."""
+        """The mean of values (n,), each from 0 to `most`, with limits."""
         total = float(self.weight.sum())
-        value, of = float(self.weight @ values) / total, self.clusters
-        if of is None:
+        value, over = float(self.weight @ values) / total, self.clusters
+        if over is None:
             return LimitedFigure(value)
-        sums, rows = (np.bincount(of.group, self.weight * column) for column in (values, np.ones(len(values))))
+        sums, rows = (np.bincount(over.group, self.weight * column) for column in (values, np.ones(len(values))))
         with np.errstate(divide="ignore", invalid="ignore"):
             without = (sums.sum() - sums) / (total - rows)
-        return self._limit_mean(of, value, without, (0.0, most), confidence)
+        return self._limit_mean(over, value, without, (0.0, most), confidence)
 
     def _limit_mean(
         self,
-        of: Clusters,
+        over: Clusters,
         value: float,
         without: Float,
         bounds: tuple[float, float],
@@ -152,16 +152,16 @@ class FigureRows:
         followed: float = 1.0,
     ) -> LimitedFigure:
         """A mean between `bounds`, from those without each group of clusters."""
-        rows, groups = of.weigh(self.weight), np.bincount(of.group, self.weight).astype(float)
-        unseen = None if of.by_run else float((rows**2).sum() / rows.sum()) / followed
-        return limit_left_out(value, without, groups, bounds, confidence, unseen, of.count if of.by_run else 0)
+        rows, groups = over.weigh(self.weight), np.bincount(over.group, self.weight).astype(float)
+        unseen = None if over.by_run else float((rows**2).sum() / rows.sum()) / followed
+        return limit_left_out(value, without, groups, bounds, confidence, unseen, over.count if over.by_run else 0)
 
     @cached_property
     def _quantile_limits(self) -> dict[float, tuple[Float, Float, Float, Int]]:
         return {}
 
     def limit_time_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The time by which a share q is detected; ∞: a smaller share ever is."""
+        """The time by which a share q is detected, with limits; ∞: fewer are ever detected."""
         found = quantile_time(*self.curve, q)
         value = math.inf if found is None else found
         if self.clusters is None:
@@ -187,39 +187,39 @@ class FigureRows:
         return times_s, *self.limit_incidence(np.append(before, times_s[steps]), confidence), steps
 
     def limit_incidence(self, at_s: Sequence[float] | Float, confidence: float) -> tuple[Float, Float]:
-        """Lower and upper limits (G,) of the cumulative incidence at instants (G,), ascending; there are clusters."""
+        """Lower and upper limits (G,) of the cumulative incidence at ascending instants (G,). Needs clusters."""
         assert self.clusters is not None
-        of, at_s, times_s = self.clusters, np.asarray(at_s, dtype=float), self.curve[0]
+        over, at_s, times_s = self.clusters, np.asarray(at_s, dtype=float), self.curve[0]
         share = np.append(0.0, self.curve[1])[np.searchsorted(times_s, at_s, side="right")]
-        if of.by_run and of.units <= 1:
-            return limit_share_of_runs(share, np.zeros((len(share), of.count)), 1, confidence)
-        units = of.weigh_units(self.weight)
-        of_group = np.bincount(of.grouped, units)
+        if over.by_run and over.units <= 1:
+            return limit_share_of_runs(share, np.zeros((len(share), over.count)), 1, confidence)
+        units = over.weigh_units(self.weight)
+        of_group = np.bincount(over.grouped, units)
         without = incidences_without(
-            *self.endings, self.weight, of.group, len(of_group), at_s, least=self.least
+            *self.endings, self.weight, over.group, len(of_group), at_s, least=self.least
         ).T  # fmt: skip
-        if of.once:
-            return self._limit_incidence_once(of, at_s, share, without, confidence)
+        if over.once:
+            return self._limit_incidence_once(over, at_s, share, without, confidence)
         residual = (of_group.sum() - of_group) * (share[:, None] - without)
         variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
-        within = np.where(variance > _SAME**2, 0.0, 1.0) if of.by_run else WITHIN_LOG
-        units = np.broadcast_to(units * (of.units if of.by_run else 1.0), (len(share), of.count))
+        within = np.where(variance > _SAME**2, 0.0, 1.0) if over.by_run else WITHIN_LOG
+        units = np.broadcast_to(units * (over.units if over.by_run else 1.0), (len(share), over.count))
         return spread_share(share, variance, units, confidence, within)
 
     def _limit_incidence_once(
-        self, of: Clusters, at_s: Float, share: Float, without: Float, confidence: float
+        self, over: Clusters, at_s: Float, share: Float, without: Float, confidence: float
     ) -> tuple[Float, Float]:
         """The same where drives weigh alike: the mean of their shares, between 0 and 1."""
         (time_s, ending), total = self.endings, float(self.weight.sum())
         order = np.argsort(time_s, kind="stable")
         lost = np.append(0.0, np.cumsum(np.where(ending == CENSORED, self.weight, 0.0)[order]))
         followed = 1.0 - lost[np.searchsorted(time_s[order], at_s, side="left")] / total
-        groups = np.broadcast_to(np.bincount(of.group, self.weight).astype(float), without.shape)
-        unseen = total / of.count / np.maximum(followed, _SAME)
+        groups = np.broadcast_to(np.bincount(over.group, self.weight).astype(float), without.shape)
+        unseen = total / over.count / np.maximum(followed, _SAME)
         return limit_bounded_mean(share, without, groups, (0.0, 1.0), 1.0, confidence, unseen)
 
     def limit_distance_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The distance beyond which a share 1 − q is detected; −∞: a smaller share ever is."""
+        """The distance beyond which a share 1 − q is detected, with limits; −∞: fewer are ever detected."""
         distance_m = self.table["distance_at_detection_m"].to_numpy(dtype=float)
         placed = ~self.known | ~np.isnan(distance_m)
         weight, ranked = self.weight[placed], np.where(self.known, distance_m, -np.inf)[placed]
@@ -229,38 +229,39 @@ class FigureRows:
         value = -math.inf if found is None else found
         if self.clusters is None:
             return LimitedFigure(value)
-        kept = self.clusters.select(placed)
-        units = None if kept.by_run else kept.units
+        clusters = self.clusters.select(placed)
+        units = None if clusters.by_run else clusters.units
         low, high = limit_ranked_quantile(
-            ranked, weight, kept.number, kept.count, units, q, confidence, once=kept.once
+            ranked, weight, clusters.number, clusters.count, units, q, confidence, once=clusters.once
         )  # fmt: skip
         if bound is None:
             return LimitedFigure(value, low, high, INVERTED)
         beyond = np.where(ranked >= bound, weight, 0.0)
-        least, most = kept.limit_share(beyond, weight, confidence)
+        least, most = clusters.limit_share(beyond, weight, confidence)
         return LimitedFigure(value, low, high, INVERTED, (least, float(beyond.sum() / weight.sum()), most))
 
 
 def limit_sums(
     sums: Float,
-    of: Callable[[Float], Any],
+    compute: Callable[[Float], Any],
     clusters: Clusters | None,
     weight: Float,
     confidence: float,
     least: float = -math.inf,
 ) -> LimitedFigure:
-    """A figure `of` sums (…, m) over rows, from `sums (n, m)`; `weight (n,)`: what it averages over; `least`: that it
-    can be.
+    """A figure with its limits: `compute` of the totals of `sums (n, m)` over rows that weigh `weight (n,)`.
+
+    `least`: its smallest possible value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         total = sums.sum(axis=0)
-        value = float(of(total))
+        value = float(compute(total))
         if not math.isfinite(value):
             return LimitedFigure(None)
         if clusters is None:
             return LimitedFigure(value)
         by_group = np.stack([np.bincount(clusters.group, column) for column in sums.T], axis=1).astype(np.float64)
-        without = np.array([float(of(total - one)) for one in by_group])
+        without = np.array([float(compute(total - group_sums)) for group_sums in by_group])
     weights = np.bincount(clusters.group, weight).astype(float)
     return limit_left_out(value, without, weights, (least, math.inf), confidence)
 
@@ -269,7 +270,7 @@ def limit_sums(
 
 
 class JudgedMetric(NamedTuple):
-    """How a metric is taken of rows. `rows`: of which: detections, implied collisions (`conflict`), those in conflict
+    """How a metric is computed from rows. `rows`: of detections, implied collisions (`conflict`), those in conflict
     (`braking`), closed forms (`exact`, `exact braking`). `limit`: the figure, from rows, horizon, confidence, bound.
     """
 
@@ -359,7 +360,7 @@ class SummedMetric(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The least that it can be: a bias has a sign."""
+        """The least possible value: a bias may be negative."""
         return -math.inf if self.sum.endswith(("east_m", "north_m")) else 0.0
 
     def value_of(self, sums: Float) -> Any:

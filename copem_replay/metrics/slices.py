@@ -50,7 +50,7 @@ Tags = Mapping[str, Mapping[str, str]]
 
 
 def find_unknown_tag(slices: Sequence[Slice], tags: Tags) -> str | None:
-    """A line on the first tag that no log has; None: there is none."""
+    """One line on the first tag that no log has; None: all are known."""
     known = sorted({name for of_log in tags.values() for name in of_log})
     for name in (name for by in slices for name in by.tags if name not in known):
         has = f"tags are {', '.join(known)}" if known else "logs have no tags"
@@ -81,14 +81,14 @@ def _name_values(table: pd.DataFrame, dimension: Dimension, tags: Tags) -> tuple
     return pd.Index(order).get_indexer(values), list(map(str, order))
 
 
-def number_groups(table: pd.DataFrame, by: Slice, tags: Tags) -> tuple[Int, list[tuple[str, ...]]]:
-    """(n,) the group of each row, and the groups that occur, each with its value of every dimension of the entry.
+def number_groups(table: pd.DataFrame, entry: Slice, tags: Tags) -> tuple[Int, list[tuple[str, ...]]]:
+    """(n,) the number of each row's group, and the groups, each with its value of every dimension of the entry.
 
     `table`: rows with the columns that the entry is about: `log`, `object_class`, `began`, `distance_at_onset_m`,
     `area`.
     """
     number, columns = np.zeros(len(table), dtype=np.int64), []
-    for dimension in by.dimensions:
+    for dimension in entry.dimensions:
         position, words = _name_values(table, dimension, tags)
         number = number * len(words) + position
         columns.append(words)
@@ -120,7 +120,7 @@ KEYS = ("configuration", *EPISODE)
 """Columns that name an episode in a configuration."""
 
 
-def sum_episodes(rows: pd.DataFrame, own: Sequence[RowMetric], words: Sequence[str], *keys: str) -> pd.DataFrame:
+def sum_episodes(rows: pd.DataFrame, metrics: Sequence[RowMetric], words: Sequence[str], *keys: str) -> pd.DataFrame:
     """Sums of accuracy and of own metrics by configuration and episode, over the runs in rows of `detections.parquet`.
 
     `keys`: further columns to sum by.
@@ -130,11 +130,11 @@ def sum_episodes(rows: pd.DataFrame, own: Sequence[RowMetric], words: Sequence[s
     count by `words` (`measure.began`).
     """
     columns = _accuracy_columns(rows) if "matched_lists" in rows else {}
-    counted = is_counted(rows, words) if own else np.zeros(0, dtype=bool)
-    for name, values in _own_columns(rows[counted], own).items() if own else ():
+    counted = is_counted(rows, words) if metrics else np.zeros(0, dtype=bool)
+    for name, values in _own_columns(rows[counted], metrics).items() if metrics else ():
         columns[name] = np.zeros(len(rows))
         columns[name][counted] = values
-    if own:
+    if metrics:
         columns[_COUNTED] = counted.astype(float)
     summed = pd.DataFrame(columns, index=rows.index).groupby([rows[name] for name in (*KEYS, *keys)], sort=False).sum()
     return summed.reset_index()
@@ -168,11 +168,11 @@ def _accuracy_columns(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _own_columns(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, Float]:
+def _own_columns(rows: pd.DataFrame, metrics: Sequence[RowMetric]) -> dict[str, Float]:
     """(n,) the statistics of own metrics, which are asked log by log and configuration by configuration."""
     columns: dict[str, Float] = {}
     for place in rows.groupby(["log", "configuration"], sort=False).indices.values():
-        for metric, of_metric in own_statistics(own, rows.iloc[place]).items():
+        for metric, of_metric in own_statistics(metrics, rows.iloc[place]).items():
             for name, values in of_metric.items():
                 columns.setdefault(f"{metric} {name}", np.zeros(len(rows)))[place] = values
     return columns
@@ -217,7 +217,7 @@ class SliceSettings:
 
 @dataclass(frozen=True)
 class StudyRows:
-    """The rows that the figures of configurations are computed from: of a whole study, of a group, of any episodes.
+    """The rows from which a configuration's figures are computed: of a study, of a group, or of any episodes.
 
     `tally`, `exact`: rows of `tally.parquet` and `exact.parquet` (None: not asked for). `sums`: of `sum_episodes`.
     `lists`: of `sum_lists`; None: without accuracy, or episodes of parts of logs, to which no false entry belongs.
@@ -245,7 +245,7 @@ class StudyRows:
 
     @cached_property
     def detections(self) -> pd.DataFrame:
-        """Of these the rows for detections, of all configurations."""
+        """The counted rows for detections, of all configurations."""
         return self.counted[self.counted["event"] == DETECTED]
 
     def _number_episodes(self, table: pd.DataFrame) -> Int:
@@ -260,49 +260,49 @@ class StudyRows:
         tables = {"tally": self.tally, "exact": self.exact, "sums": self.sums}
         return {name: self._number_episodes(table) for name, table in tables.items() if table is not None}
 
-    def select(self, kept: Bool, logs: Collection[str] | None = None) -> StudyRows:
-        """The rows of some episodes, `kept (E,)`. `logs`: where they are all of these logs; else None."""
+    def select(self, is_kept: Bool, logs: Collection[str] | None = None) -> StudyRows:
+        """The rows of the episodes in `is_kept (E,)`. `logs`: where these are all episodes of the logs; else None."""
 
         def rows_of(name: str) -> Any:
             table = getattr(self, name)
-            return None if table is None else table[kept[self._episode_of[name]]]
+            return None if table is None else table[is_kept[self._episode_of[name]]]
 
         lists = None if logs is None or self.lists is None else self.lists[self.lists["log"].isin(logs)]
         return replace(self, tally=rows_of("tally"), exact=rows_of("exact"), sums=rows_of("sums"), lists=lists)
 
-    def split(self, by: Slice) -> list[Group]:
+    def split(self, entry: Slice) -> list[Group]:
         """The groups of an entry, each with at least one episode, in the order in which they are shown.
 
         By `began` each group counts its own episodes, whatever `measure.began` says.
         """
-        number, names = number_groups(self.episodes, by, self.tags)
-        settings = replace(self.settings, words=BEGAN) if by.names(BEGAN_BY) else self.settings
+        number, names = number_groups(self.episodes, entry, self.tags)
+        settings = replace(self.settings, words=BEGAN) if entry.names(BEGAN_BY) else self.settings
         logs_of: dict[tuple[str, ...], list[str]] = {}
-        if by.of_logs:
+        if entry.of_logs:
             logs = pd.DataFrame({"log": list(self.tags)})
-            of_logs, names_of_logs = number_groups(logs, by, self.tags)
+            of_logs, names_of_logs = number_groups(logs, entry, self.tags)
             for log, k in zip(self.tags, of_logs.tolist(), strict=True):
                 logs_of.setdefault(names_of_logs[k], []).append(log)
         return [
-            Group(by, values, replace(self.select(number == k, logs_of.get(values)), settings=settings))
+            Group(entry, values, replace(self.select(number == k, logs_of.get(values)), settings=settings))
             for k, values in enumerate(names)
         ]
 
     def inputs(self, configuration: str) -> MetricInputs:
-        """What the statistics of a configuration are computed from, as for a row of `summary.csv`."""
-        own, of = self.settings, self._of(configuration)
-        conflicts = of(self.counted[self.counted["event"] == CONFLICT]) if own.conflicts else None
+        """The inputs of a configuration's statistics, as for a row of `summary.csv`."""
+        settings, rows_of = self.settings, self._of(configuration)
+        conflicts = rows_of(self.counted[self.counted["event"] == CONFLICT]) if settings.conflicts else None
         return MetricInputs(
-            of(self.detections),
+            rows_of(self.detections),
             None,
-            own.horizon_s,
-            facts=own.facts.get(configuration),
-            accuracy=None if own.accuracy is None else self._total(configuration, own.accuracy),
-            exact=None if self.exact is None else of(select_counted(self.exact, own.words)),
+            settings.horizon_s,
+            facts=settings.facts.get(configuration),
+            accuracy=None if settings.accuracy is None else self._total(configuration, settings.accuracy),
+            exact=None if self.exact is None else rows_of(select_counted(self.exact, settings.words)),
             conflicts=conflicts,
-            own=self._own_sums(of(self.sums)),
-            weigh=own.weigh,
-            driving=None if self.lists is None else of(self.lists),
+            own=self._own_sums(rows_of(self.sums)),
+            weigh=settings.weigh,
+            driving=None if self.lists is None else rows_of(self.lists),
         )
 
     @staticmethod
@@ -310,12 +310,12 @@ class StudyRows:
         return lambda table: table[table["configuration"] == configuration]
 
     def _own_sums(self, sums: pd.DataFrame) -> dict[str, OwnSums]:
-        own: dict[str, OwnSums] = {}
+        sums_of: dict[str, OwnSums] = {}
         counted = _COUNTED in sums and bool(sums[_COUNTED].any())
         for name in sums.columns.difference([*KEYS, *_SUMMED, *_ROWS, _COUNTED], sort=False) if counted else ():
             metric, _, statistic = name.partition(" ")
-            own.setdefault(metric, {})[statistic] = float(sums[name].sum())
-        return own
+            sums_of.setdefault(metric, {})[statistic] = float(sums[name].sum())
+        return sums_of
 
     def _total(self, configuration: str, settings: AccuracySettings) -> AccuracyTotal:
         """The sums of accuracy that the rows tell; NaN: those that they do not."""
@@ -347,7 +347,7 @@ class Group:
 
     @property
     def label(self) -> str:
-        """The values: `crossing, pedestrian`."""
+        """The values in words: `crossing, pedestrian`."""
         return ", ".join(self.values)
 
 
@@ -414,9 +414,7 @@ def _leave_out_limits(figures: dict[str, Any], share: str, prefix: str, counts: 
 
 
 def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
-    """Whether an interval excludes a share; None: there is none, or the share is that of all or none, which no group
-    can stand out from.
-    """
+    """Whether an interval excludes a share that is not 0 or 1, as no group stands out from these; None: no interval."""
     low, high = figures["detected_share_low"], figures["detected_share_high"]
     if low is None or share is None or share in (0.0, 1.0):
         return None
@@ -424,9 +422,7 @@ def _is_apart(figures: Mapping[str, Any], share: float | None) -> bool | None:
 
 
 def describe_chance(table: pd.DataFrame) -> list[str]:
-    """A line for each entry in rows of `summary_by.csv`: how many groups were looked at, how many stand out, and how
-    many would by chance.
-    """
+    """One line per entry of `summary_by.csv`: number of groups, how many stand out, and how many would by chance."""
     lines = []
     for by, rows in table.groupby("by", sort=False):
         judged = rows["apart"].dropna().astype(bool)

@@ -162,7 +162,7 @@ def settle_horizon(counted: pd.DataFrame, asked_s: float) -> tuple[float, list[s
 
 
 def describe_followed(counted: pd.DataFrame, horizon_s: float) -> str | None:
-    """How few of the episodes that count last as long as the horizon; None: enough for a restricted mean."""
+    """One line where too few counted episodes last as long as the horizon; None: enough for a restricted mean."""
     number, needed, followed, _ = _count_followed(counted, horizon_s)
     return None if followed >= needed else _format_followed(number, followed, horizon_s)
 
@@ -173,9 +173,7 @@ def _format_followed(number: int, followed: int, asked_s: float) -> str:
 
 
 def _count_followed(counted: pd.DataFrame, asked_s: float) -> tuple[int, int, int, float]:
-    """How many episodes count, how many have to last for a restricted mean, how many last `asked_s`; how long enough
-    of them last.
-    """
+    """How many episodes count, are needed for a restricted mean, last `asked_s`; how long enough of them last."""
     episodes = counted.drop_duplicates([*EPISODE])
     length_s = np.sort(np.round((episodes["ended_s"] - episodes["onset_s"]).to_numpy(dtype=float), 9))[::-1]
     number = len(length_s)
@@ -189,18 +187,18 @@ Sums = Mapping[str, Mapping[str, OwnSums]]
 
 
 def summarise_rows(
-    rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **given: Any
+    rows: pd.DataFrame, configurations: Sequence[str], list_rate_hz: Mapping[str, float | None], **extra: Any
 ) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of `summary.csv`, and notes, from rows of `detections.parquet`. `given`: as for `summarise_tally`."""
-    own, asked = own_sums_by_log(rows, given.get("own", ())), "conflict_detected" in rows
-    return summarise_tally(tally_rows(rows), configurations, list_rate_hz, sums=own, conflicts_asked=asked, **given)
+    """The rows of `summary.csv`, and notes, from rows of `detections.parquet`. `extra`: as for `summarise_tally`."""
+    sums, implied = own_sums_by_log(rows, extra.get("own", ())), "conflict_detected" in rows
+    return summarise_tally(tally_rows(rows), configurations, list_rate_hz, sums=sums, conflicts_asked=implied, **extra)
 
 
-def own_sums_by_log(rows: pd.DataFrame, own: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
+def own_sums_by_log(rows: pd.DataFrame, metrics: Sequence[RowMetric]) -> dict[str, dict[str, OwnSums]]:
     """Sums of own metrics by configuration and name, over rows of `detections.parquet`, added log by log."""
     sums: dict[str, dict[str, OwnSums]] = {}
-    for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if own else ():
-        sums = add_own_sums(sums, {str(name): own_sums(own, part)})
+    for (_, name), part in rows.groupby(["log", "configuration"], sort=False) if metrics else ():
+        sums = add_own_sums(sums, {str(name): own_sums(metrics, part)})
     return sums
 
 
@@ -273,7 +271,7 @@ def summarise_tally(
 
 
 def describe_began(tallied: pd.DataFrame, configuration: str, horizon_s: float | None, words: Sequence[str]) -> str:
-    """A line: how many episodes began how, and the mean time of each group in one configuration.
+    """One line: how many episodes began in each way, and the mean time of each group in one configuration.
 
     `tallied`: the whole tally. `words`: `measure.began`, those that count.
     """
@@ -339,7 +337,7 @@ SETUP = ("n", "list_rate_hz", "n_conflict", "driving_h", "must_brake_s")
 
 
 def describe_mean(horizon_s: float, *, censored: bool) -> str:
-    """What a restricted mean is of. `censored`: whether rows are still undetected when the ego or the log ends."""
+    """The words for a restricted mean. `censored`: whether rows are still undetected when the ego or the log ends."""
     up_to = f"{format_cell(horizon_s)} s"
     words = f"mean of min(time to detection, {up_to}), never detected counting as {up_to}"
     if not censored:
@@ -389,7 +387,7 @@ def format_summary(summary: pd.DataFrame, width: int | None = None) -> str:
 
 
 def describe_no_needless(summary: pd.DataFrame) -> str | None:
-    """How rare braking for nothing is at most where nobody does, or that it cannot be known; None: somebody does."""
+    """The upper limit of needless braking where nobody does it, or that it is unknown; None: somebody does."""
     driving_h = float(summary["driving_h"].max())
     if not driving_h > 0:
         return "braking for nothing: not known, for the ego does not drive"
@@ -413,12 +411,12 @@ def _needless_lines(summary: pd.DataFrame, width: int | None) -> list[str]:
 def _part_lines(summary: pd.DataFrame, part: str, width: int | None, share: str = "") -> list[str]:
     """The columns of a part, the limits of its share beside it; below them the set-up that all have alike."""
     names = ["configuration", *(metric.name for metric in METRICS if metric.part == part and metric.name in summary)]
-    alike = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
-    names = [name for name in names if name not in alike]
+    shared = {name: format_cell(summary[name].iloc[0]) for name in names if name in SETUP and _is_alike(summary[name])}
+    names = [name for name in names if name not in shared]
     if share:
         summary = summary.assign(**{"95 %": _interval_lines(summary, share)})
         names.insert(names.index(share) + 1, "95 %")
-    below = [f"all configurations: {', '.join(f'{name} {value}' for name, value in alike.items())}"] if alike else []
+    below = [f"all configurations: {', '.join(f'{name} {value}' for name, value in shared.items())}"] if shared else []
     return [format_table(summary[names], width), *below]
 
 
@@ -432,9 +430,7 @@ def _interval_lines(summary: pd.DataFrame, share: str) -> list[str]:
 
 
 def describe_intervals(summary: pd.DataFrame, name: str) -> list[str]:
-    """Lines on the limits: their kind, from the column `name`, what they are over, and what that cannot exclude; on the
-    rows without limits as nothing is drawn.
-    """
+    """Lines on the limits: their kind (column `name`), what they are over, what they miss; on rows without limits."""
     columns = [name, f"{name}_over", f"{name}_clusters"]
     limited = summary.reindex(columns=columns).dropna(subset=columns[1]).drop_duplicates()
     kinds = [
@@ -474,14 +470,14 @@ def _align_column(column: Sequence[str], *, to_left: bool) -> list[str]:
 def _split_columns(first: Sequence[str], others: Sequence[list[str]], width: int | None) -> list[list[list[str]]]:
     """The other columns in groups that fit beside the first one; each group has at least one."""
     blocks: list[list[list[str]]] = []
-    used = 0
+    width_used = 0
     for column in others:
         size = len(_GAP) + len(column[0])
-        if not blocks or (width is not None and used + size > width and blocks[-1]):
+        if not blocks or (width is not None and width_used + size > width and blocks[-1]):
             blocks.append([])
-            used = len(first[0])
+            width_used = len(first[0])
         blocks[-1].append(column)
-        used += size
+        width_used += size
     return blocks
 
 

@@ -64,7 +64,7 @@ class DetectionStatistics:
     rows: bool
 
     def quantile_s(self, q: float) -> float | None:
-        """Seconds by which a share q is detected; None: a smaller share ever is."""
+        """Seconds by which a share q is detected; None: fewer are ever detected."""
         return quantile_time(self.times_s, self.incidence, q) if self.rows else None
 
     def mean_s(self) -> float | None:
@@ -209,7 +209,7 @@ def limit_means(inputs: MetricInputs) -> tuple[LimitedFigure, LimitedFigure]:
 
 
 def _end_of_mean(k: int, end: str) -> Callable[[tuple[LimitedFigure, ...]], float | None]:
-    return lambda of: _number_or_none(float(getattr(of[k], end)))
+    return lambda limits: _number_or_none(float(getattr(limits[k], end)))
 
 
 def estimate_foreseen_share(inputs: MetricInputs) -> float | None:
@@ -259,22 +259,22 @@ def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
     return ExactStatistics(weight[known].sum() / weight.sum(), times, unknown, missed)
 
 
-def _summarise_missed(never: pd.DataFrame) -> dict[str, float | None]:
+def _summarise_missed(rows: pd.DataFrame) -> dict[str, float | None]:
     """How probably an episode misses its object, from the rows of `exact.parquet` for never: one per episode.
 
     Base-10 logarithms of the mean probability. Its derivative by the log-odds of detection weighs each episode by its
     share of the mean.
     """
     names = ("miss_log10", "miss_log10_half_odds")
-    if not never["miss_log10"].notna().any():
+    if not rows["miss_log10"].notna().any():
         return dict.fromkeys((*names, "miss_per_logit"))
     shares: dict[str, Float] = {}
     row: dict[str, float | None] = {}
     for name in names:
-        log10 = never[name].fillna(-np.inf).to_numpy(dtype=float)
+        log10 = rows[name].fillna(-np.inf).to_numpy(dtype=float)
         shares[name] = np.power(10.0, log10 - log10.max())
         row[name] = float(log10.max() + np.log10(shares[name].mean()))
-    weight, slope = shares["miss_log10"], never["miss_per_logit"].fillna(0.0).to_numpy(dtype=float)
+    weight, slope = shares["miss_log10"], rows["miss_per_logit"].fillna(0.0).to_numpy(dtype=float)
     return row | {"miss_per_logit": float(weight @ slope / weight.sum())}
 
 
@@ -297,19 +297,19 @@ def _number_or_none(value: float) -> float | None:
 
 
 def _limit_metrics(
-    of: str, statistics: Callable[[MetricInputs], ShareEstimate | None], prefix: str = ""
+    share: str, statistics: Callable[[MetricInputs], ShareEstimate | None], prefix: str = ""
 ) -> tuple[Metric, ...]:
     """The columns beside a share: its limits, their kind, and the clusters they are over."""
     row = partial(Metric, statistics=statistics, better=0)
     return (
-        row(f"{of}_low", value=attrgetter("low"), help=f"lower limit of {of}, 95 %"),
-        row(f"{of}_high", value=attrgetter("high"), help=f"upper limit of {of}, 95 %"),
+        row(f"{share}_low", value=attrgetter("low"), help=f"lower limit of {share}, 95 %"),
+        row(f"{share}_high", value=attrgetter("high"), help=f"upper limit of {share}, 95 %"),
         row(f"{prefix}interval", value=attrgetter("kind"), kind="text",
-            help=f"kind of the limits of {of}, or why there are none"),
+            help=f"kind of the limits of {share}, or why there are none"),
         row(f"{prefix}interval_over", value=attrgetter("over"), kind="text", among=tuple(CLUSTERS),
-            help=f"what the limits of {of} are over: logs, objects of one log, passes or runs of one object"),
+            help=f"what the limits of {share} are over: logs, objects of one log, passes or runs of one object"),
         row(f"{prefix}interval_clusters", value=attrgetter("clusters"),
-            help=f"how many of these the limits of {of} are over"),
+            help=f"how many of these the limits of {share} are over"),
     )  # fmt: skip
 
 
@@ -395,7 +395,7 @@ def _exact_metric(name: str, value: Callable[[ExactStatistics], float | None], b
 
 def _exact_missed(name: str, help: str) -> Metric:
     find = itemgetter(name)
-    return Metric(name, summarise_exact, lambda of: find(of.missed), -1, help)
+    return Metric(name, summarise_exact, lambda exact: find(exact.missed), -1, help)
 
 
 _EXACT_METRICS = (

@@ -162,15 +162,15 @@ def _leave_out_clusters(
     censored = ending == CENSORED
     lost_s = np.unique(time_s[censored])
     span = np.searchsorted(lost_s, time_s, side="left")
-    rest = _RestOfClusters(cluster, clusters, span, np.empty(0), np.empty(0))
-    within = rest.sums(weight, span, len(lost_s) + 1)
+    left_out = _RestOfClusters(cluster, clusters, span, np.empty(0), np.empty(0))
+    within = left_out.sums(weight, span, len(lost_s) + 1)
     total = within.sum(axis=1)
-    lost = rest.sums(np.where(censored, weight, 0.0), span, len(lost_s) + 1)[:, :-1]
+    lost = left_out.sums(np.where(censored, weight, 0.0), span, len(lost_s) + 1)[:, :-1]
     remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
     remains = remaining >= np.maximum(least * total * (1 - 1e-9), 1e-300)[:, None]
     factors = np.where(remains, 1.0 + lost / np.where(remains, remaining, 1.0), 1.0)
     handed = np.concatenate([np.ones((clusters, 1)), np.cumprod(factors, axis=1)], axis=1)
-    return replace(rest, total=total, handed=handed)
+    return replace(left_out, total=total, handed=handed)
 
 
 def restricted_means_without(
@@ -187,12 +187,12 @@ def restricted_means_without(
 
     Rows (n,) and `least` as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
     """
-    rest = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
+    left_out = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
     gain = np.where(ending == DETECTED, weight * np.maximum(horizon_s - time_s, 0.0), 0.0)
-    gained = rest.sums(gain, rest.span, rest.handed.shape[1])
+    gained = left_out.sums(gain, left_out.span, left_out.handed.shape[1])
     with np.errstate(divide="ignore", invalid="ignore"):
-        means: Float = horizon_s - (gained * rest.handed).sum(axis=1) / rest.total
-    return np.where(rest.total > 0, means, np.nan)
+        means: Float = horizon_s - (gained * left_out.handed).sum(axis=1) / left_out.total
+    return np.where(left_out.total > 0, means, np.nan)
 
 
 def incidences_without(
@@ -209,16 +209,16 @@ def incidences_without(
 
     Rows (n,) and `least` as for `cumulative_incidence`; `cluster (n,)`: 0 … K − 1.
     """
-    rest = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
+    left_out = _leave_out_clusters(time_s, ending, weight, cluster, clusters, least)
     # Detections between two instants and two censorings have the same weight handed on.
-    spans, step = rest.handed.shape[1], np.searchsorted(at_s, time_s, side="left")
-    known, part = np.unique(step * spans + rest.span, return_inverse=True)
-    detections = rest.sums(np.where(ending == DETECTED, weight, 0.0), part, len(known))
-    gained = np.cumsum(detections * rest.handed[:, known % spans], axis=1)
+    spans, step = left_out.handed.shape[1], np.searchsorted(at_s, time_s, side="left")
+    known, part = np.unique(step * spans + left_out.span, return_inverse=True)
+    detections = left_out.sums(np.where(ending == DETECTED, weight, 0.0), part, len(known))
+    gained = np.cumsum(detections * left_out.handed[:, known % spans], axis=1)
     until = np.searchsorted(known // spans, np.arange(len(at_s)), side="right")
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.concatenate([np.zeros((clusters, 1)), gained], axis=1)[:, until] / rest.total[:, None]
-    return np.where(rest.total[:, None] > 0, np.minimum(shares, 1.0), np.nan)
+        shares = np.concatenate([np.zeros((clusters, 1)), gained], axis=1)[:, until] / left_out.total[:, None]
+    return np.where(left_out.total[:, None] > 0, np.minimum(shares, 1.0), np.nan)
 
 
 def compute_unknown_s(time_s: Float, length_s: Float) -> Float:
@@ -260,7 +260,7 @@ class EndReason(Enum):
 
     @property
     def label(self) -> str:
-        """Two words for figures."""
+        """The reason in two words, for figures."""
         return _WORDS[self][0]
 
     @property
@@ -286,6 +286,6 @@ def end_reason_texts(position: Int) -> np.ndarray:
 
 
 def is_competing(ended_by: pd.Series) -> Bool:
-    """(n,) whether texts (n,) are those of a reason that is no censoring."""
+    """(n,) whether these texts of `ended_by` name a departure, not a censoring."""
     competing: Bool = ended_by.isin(COMPETES).to_numpy(dtype=bool)
     return competing

@@ -159,13 +159,13 @@ class Placement(Frozen):
 
 def _describe_polygon_fault(reason: str) -> str:
     """What is wrong with a polygon, from the reason that shapely gives, such as `Self-intersection[5 5]`."""
-    what, _, place = reason.rstrip("]").partition("[")
+    fault, _, place = reason.rstrip("]").partition("[")
     where = f" at [{', '.join(place.split())}]" if place else ""
     words = {
         "Self-intersection": f"edges that cross or overlap{where}",
         "Ring Self-intersection": f"edges that meet{where}",
     }
-    return words.get(what, "corners without an area between them")
+    return words.get(fault, "corners without an area between them")
 
 
 def check_polygon(points_m: tuple[Point, ...], key: str = "polygon_m") -> tuple[Point, ...]:

@@ -205,16 +205,16 @@ def _draw_fresh(
     if hosts.row is not None:
         present = hosts.row.ravel() >= 0
         host_ix, list_ix = host_ix[present], list_ix[present]
-    none = np.zeros(len(host_ix), dtype=np.int64)
-    random_key = RandomKey((lists.name,), none, hosts.words[host_ix], lists.stamp_ns[list_ix])
+    zeros = np.zeros(len(host_ix), dtype=np.int64)
+    random_key = RandomKey((lists.name,), zeros, hosts.words[host_ix], lists.stamp_ns[list_ix])
     [uniform] = rng.uniform(f"ghosts {n}", random_key, runs)
     count = _count_ghosts(uniform, sort.in_list)
-    which = np.repeat(np.arange(len(count)), count)
-    number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-    born_ns = lists.stamp_ns[list_ix[which]].astype(np.uint64)
-    words = hosts.words[host_ix[which]] + born_ns + (number.astype(np.uint64) << _NUMBER_BITS) + salt
-    host = hosts.row[host_ix[which], list_ix[which]] if hosts.row is not None else np.full(len(which), -1)
-    return _Born(words, np.arange(len(which)), list_ix[which], host)
+    draw_ix = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(draw_ix)) - np.repeat(np.cumsum(count) - count, count)
+    born_ns = lists.stamp_ns[list_ix[draw_ix]].astype(np.uint64)
+    words = hosts.words[host_ix[draw_ix]] + born_ns + (number.astype(np.uint64) << _NUMBER_BITS) + salt
+    host = hosts.row[host_ix[draw_ix], list_ix[draw_ix]] if hosts.row is not None else np.full(len(draw_ix), -1)
+    return _Born(words, np.arange(len(draw_ix)), list_ix[draw_ix], host)
 
 
 def _count_ghosts(uniform: Float, mean: float) -> Int:
@@ -232,12 +232,12 @@ def _place_ghosts(
 ) -> tuple[Tracks, ViewGeometry]:
     """Ghosts without any error, a track for each, and their view geometry from the unit: wholly visible."""
     n, sort = numbered
-    none = np.zeros(len(born.words), dtype=np.int64)
-    random_key = RandomKey((lists.name,), none, born.words, none)
+    zeros = np.zeros(len(born.words), dtype=np.int64)
+    random_key = RandomKey((lists.name,), zeros, born.words, zeros)
     place = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
     turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
     shares = class_row(sort.classes)[None]
-    class_ix = draw_classes(shares, none, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
+    class_ix = draw_classes(shares, zeros, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
     pose_ix, poses, host = lists.pose_ix[born.list_ix], lists.poses, born.host
     x_m, y_m, heading_rad = poses.x_m[pose_ix], poses.y_m[pose_ix], poses.heading_rad[pose_ix]
     ground_m, length_m, width_m = poses.ground_m[pose_ix], np.zeros(len(born.words)), np.zeros(len(born.words))

@@ -76,20 +76,20 @@ class KeptShares:
         self._kept: dict[tuple[str, float, float], Float] = {}
 
     def of(
-        self, units: str, world: Tracks, times_s: tuple[float, float, float], seen: Callable[[Tracks], Float]
+        self, units: str, world: Tracks, times_s: tuple[float, float, float], compute: Callable[[Tracks], Float]
     ) -> Float:
         """Shares (U, P) of a world captured from the first of `times_s` on and before the last, cut at the one between.
 
-        `units`: a name for the units. `seen` computes the shares of a part, once for each.
+        `units`: a name for the units. `compute` computes the shares of a part, once for each.
         """
         from_s, cut_s, until_s = times_s
-        shares = self._part(units, world, cut_s, until_s, seen)
+        shares = self._part(units, world, cut_s, until_s, compute)
         if from_s >= cut_s:
             return shares
         late = world.row_captured_s >= cut_s
         whole = np.empty((len(shares), len(late)))
         whole[:, late] = shares
-        whole[:, ~late] = self._part(units, world, from_s, cut_s, seen)
+        whole[:, ~late] = self._part(units, world, from_s, cut_s, compute)
         return whole
 
     def _part(self, units: str, world: Tracks, from_s: float, until_s: float, seen: Callable[[Tracks], Float]) -> Float:
@@ -124,7 +124,7 @@ def observe_objects(
     *,
     from_s: float = -np.inf,
     until_s: float = np.inf,
-    kept: KeptShares | None = None,
+    cache: KeptShares | None = None,
     cut_s: float | None = None,
     as_read: bool = False,
     only_ix: Int | None = None,
@@ -132,7 +132,7 @@ def observe_objects(
     """All observation rows of an experiment's units over one log (`truth`: the world at its own frames).
 
     Only rows captured from `from_s` on and before `until_s` (a time chunk); lists are always complete. `placed`: where
-    the units are, None: it is computed. `kept`: visible shares of this log and its units; `cut_s`: the instant from
+    the units are, None: it is computed. `cache`: visible shares of this log and its units; `cut_s`: the instant from
     which on other calls ask for these rows again, None: `from_s`.
 
     `as_read`: shares are NaN where nothing reads them: where no couple can apply, except for the ego. `only_ix`: the
@@ -142,11 +142,11 @@ def observe_objects(
         placed = place_units(scene, truth, experiment)
     pieces: dict[str, tuple[Tracks, ViewGeometry]] = {}
     for names, world in interpolate_worlds(scene, truth, experiment, placed, from_s, until_s):
-        asked = partial(
+        needed = partial(
             _ask_for_shares, names, scene=scene, experiment=experiment, placed=placed, as_read=as_read, only_ix=only_ix,
         )  # fmt: skip
-        seen = partial(_see_world, names, experiment=experiment, placed=placed, asked=asked)
-        shares = seen(world) if kept is None else kept.of(names[0], world, (from_s, cut_s or from_s, until_s), seen)
+        see = partial(_see_world, names, experiment=experiment, placed=placed, needed=needed)
+        shares = see(world) if cache is None else cache.of(names[0], world, (from_s, cut_s or from_s, until_s), see)
         if only_ix is not None:
             rows = np.flatnonzero(np.isin(world.row_object_ix, only_ix))
             world, shares = world.take_rows(rows), shares[:, rows]
@@ -162,12 +162,12 @@ def observe_objects(
 
 def _see_world(
     names: Sequence[str], world: Tracks, *, experiment: PerceptionSetup, placed: SensorPoses,
-    asked: Callable[[Tracks], Bool | None],
+    needed: Callable[[Tracks], Bool | None],
 ) -> Float:  # fmt: skip
     """Visible shares (U, P) of a world at the lists of the units `names`."""
     carriers = np.array([placed.carrier_ix[name] for name in names])
     watching = make_observers([placed.poses[name] for name in names], carriers)
-    return visible_shares(world, placed.static, watching, experiment.visibility, asked(world))
+    return visible_shares(world, placed.static, watching, experiment.visibility, needed(world))
 
 
 def _ask_for_shares(
@@ -180,13 +180,13 @@ def _ask_for_shares(
     if not as_read:
         return None
     class_ix, is_ego = scene.object_class[world.row_object_ix], world.row_object_ix == scene.ego_ix
-    asked: Bool = np.empty((len(names), len(is_ego)), dtype=bool)
+    needed: Bool = np.empty((len(names), len(is_ego)), dtype=bool)
     for k, name in enumerate(names):
         pem = experiment.pems[str(experiment.units[name].pem)].couples
         with np.errstate(invalid="ignore"):  # where the unit is absent
             view = compute_view(world, placed.poses[name], world.frame_ix, np.zeros(len(is_ego)), class_ix)
-            asked[k] = is_ego | may_apply(pem, view, scene.tags)
-    return asked
+            needed[k] = is_ego | may_apply(pem, view, scene.tags)
+    return needed
 
 
 def interpolate_worlds(

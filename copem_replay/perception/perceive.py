@@ -72,14 +72,14 @@ def make_draws(scene: Scene, observations: Observations, experiment: PerceptionS
 
 
 def add_states(
-    scene: Scene, seen: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
+    scene: Scene, tracks: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
 ) -> Tracks:
     """The lists with the errors of their couples and of the units' poses; `draws` None: with the mean errors alone."""
-    seen = _add_errors(seen, observations, experiment, draws)
+    tracks = _add_errors(tracks, observations, experiment, draws)
     return (
-        seen
+        tracks
         if draws is None
-        else apply_pose_errors(scene, seen, observations.tracks, observations.view, experiment, draws.runs)
+        else apply_pose_errors(scene, tracks, observations.tracks, observations.view, experiment, draws.runs)
     )
 
 
@@ -95,14 +95,14 @@ def _draw_detected(observations: Observations, experiment: PerceptionSetup, draw
     if not by_parts:
         return draws.rng.bernoulli("detection", draws.random_key, draws.runs, observations.probability)
     valid = np.empty((len(draws.runs), P), dtype=np.bool_)
-    fresh = np.ones(P, dtype=np.bool_)
+    memoryless = np.ones(P, dtype=np.bool_)
     for parts, pieces in by_parts.items():
         rows = np.sort(np.concatenate(pieces))
-        fresh[rows] = False
+        memoryless[rows] = False
         valid[:, rows] = draws.take(rows).uniform("detection", parts) < observations.probability[rows]
-    rest = np.flatnonzero(fresh)
-    valid[:, rest] = draws.rng.bernoulli(
-        "detection", draws.random_key.take(rest), draws.runs, observations.probability[rest]
+    memoryless_rows = np.flatnonzero(memoryless)
+    valid[:, memoryless_rows] = draws.rng.bernoulli(
+        "detection", draws.random_key.take(memoryless_rows), draws.runs, observations.probability[memoryless_rows]
     )
     return valid
 
@@ -115,16 +115,16 @@ def _draw_noise(draws: UnitDraws | None, memory: Mapping[str, Parts], valid: Boo
 
 
 def _add_errors(
-    seen: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
+    tracks: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
 ) -> Tracks:
     """The lists with the errors of the couples that apply, and the variances that units state."""
-    S, P = seen.valid.shape
+    S, P = tracks.valid.shape
     columns: dict[str, Any] = {}
 
     def per_run(name: str) -> Float:
         # A value without error keeps its one row for all runs.
         if name not in columns:
-            columns[name] = np.repeat(getattr(seen, name), S, axis=0)
+            columns[name] = np.repeat(getattr(tracks, name), S, axis=0)
         column: Float = columns[name]
         return column
 
@@ -132,7 +132,7 @@ def _add_errors(
         name: np.zeros((1, P))
         for name in ("cov_ee_m2", "cov_en_m2", "cov_nn_m2", "yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")
     }
-    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(seen), strict=True):
+    for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c, couple in enumerate(pem.couples):
             rows = unit_rows[observations.couple_ix[unit_rows] == c]
@@ -142,7 +142,7 @@ def _add_errors(
             drawn = None if draws is None else draws.take(rows)
             # Consecutive rows are a view, others a copy.
             columns_at = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] < len(rows) else rows
-            noise = partial(_draw_noise, drawn, pem.memory_of(c), seen.valid[:, columns_at])
+            noise = partial(_draw_noise, drawn, pem.memory_of(c), tracks.valid[:, columns_at])
             errors = ask_errors(couple.error, observations.view.take(rows), noise, S, where)
             per_run("x_m")[:, columns_at] += errors.east_m
             per_run("y_m")[:, columns_at] += errors.north_m
@@ -158,19 +158,19 @@ def _add_errors(
                     size[:, columns_at] = np.maximum(size[:, columns_at] + errors.size_m[axis], SMALLEST_SIZE_M)
                 spread["size_var_m2"][0, columns_at] = errors.size_var_m2
             if errors.speed_mps is not None:
-                east, north = _travel_direction(seen, observations.view.speed_mps[rows], columns_at)
+                east, north = _travel_direction(tracks, observations.view.speed_mps[rows], columns_at)
                 per_run("vx_mps")[:, columns_at] += errors.speed_mps * east
                 per_run("vy_mps")[:, columns_at] += errors.speed_mps * north
                 spread["speed_var_m2ps2"][0, columns_at] = errors.speed_var_m2ps2
-    return replace(seen, **columns, **spread)
+    return replace(tracks, **columns, **spread)
 
 
-def _travel_direction(seen: Tracks, speed_mps: Float, columns_at: Any) -> tuple[Float, Float]:
+def _travel_direction(tracks: Tracks, speed_mps: Float, columns_at: Any) -> tuple[Float, Float]:
     """East and north (K,) of the direction of travel, of the heading where an object stands."""
     moving, divisor = speed_mps > 0, np.maximum(speed_mps, 1e-9)
-    yaw_rad = seen.yaw_rad[0, columns_at]
-    east = np.where(moving, seen.vx_mps[0, columns_at] / divisor, np.cos(yaw_rad))
-    north = np.where(moving, seen.vy_mps[0, columns_at] / divisor, np.sin(yaw_rad))
+    yaw_rad = tracks.yaw_rad[0, columns_at]
+    east = np.where(moving, tracks.vx_mps[0, columns_at] / divisor, np.cos(yaw_rad))
+    north = np.where(moving, tracks.vy_mps[0, columns_at] / divisor, np.sin(yaw_rad))
     return east, north
 
 
@@ -189,7 +189,7 @@ class EntryClaims(NamedTuple):
     track_id: Int  # (P,)
 
     def followed_by(self, others: EntryClaims) -> EntryClaims:
-        """The claims of these rows and then of the others."""
+        """The claims of these rows, then those of other rows."""
         columns: Any = map(np.concatenate, zip(self, others, strict=True))
         return EntryClaims(*columns)
 
@@ -273,42 +273,42 @@ def _claim_track_ids(draws: UnitDraws, lasts_s: float) -> Int:
 
 
 def apply_pose_errors(
-    scene: Scene, seen: Tracks, true: Tracks, view: ViewGeometry, setup: PerceptionSetup, runs: Int
+    scene: Scene, tracks: Tracks, true: Tracks, view: ViewGeometry, setup: PerceptionSetup, runs: Int
 ) -> Tracks:
     """The lists of the units in the runs (S,), moved by the errors of the units about their own poses.
 
-    `seen`: rows (P,) without these errors; `true`: the rows without any error; `view`: their view geometry.
+    `tracks`: rows (P,) without these errors; `true`: the rows without any error; `view`: their view geometry.
     """
     for name, unit in setup.modelled.items():
         if (placed := unit.placed) is None:
             continue
-        rows = np.flatnonzero(seen.row_unit_ix == seen.units.index(name))
+        rows = np.flatnonzero(tracks.row_unit_ix == tracks.units.index(name))
         # From the true place of the unit.
         from_unit_m = view.range_m[rows] * np.stack([np.cos(view.bearing_rad[rows]), np.sin(view.bearing_rad[rows])])
         true_m = np.stack([true.x_m[0, rows], true.y_m[0, rows]])
-        seen = displace_rows(scene, seen, rows, true_m - from_unit_m, from_unit_m, placed, (setup.seed, name, runs))
-    return seen
+        tracks = displace_rows(scene, tracks, rows, true_m - from_unit_m, from_unit_m, placed, (setup.seed, name, runs))
+    return tracks
 
 
 def displace_rows(
-    scene: Scene, seen: Tracks, rows: Int, at_m: Float, from_unit_m: Float, placed: PoseError,
+    scene: Scene, tracks: Tracks, rows: Int, at_m: Float, from_unit_m: Float, placed: PoseError,
     address: tuple[int, str, Int],
 ) -> Tracks:  # fmt: skip
     """Rows (K,) of one unit moved by its pose errors about its place `at_m`; they are `from_unit_m` away, (2, K) each.
 
     `address`: seed, unit, runs.
     """
-    frames, of_row = np.unique(seen.frame_ix[rows], return_inverse=True)
-    drawn = _draw_pose_errors(scene, seen, frames, placed, address)
-    seen = _shift_rows(seen, rows, at_m, tuple(error[:, of_row] for error in drawn))
-    return _state_pose_covariance(seen, rows, from_unit_m, placed) if placed.stated else seen
+    frames, of_row = np.unique(tracks.frame_ix[rows], return_inverse=True)
+    drawn = _draw_pose_errors(scene, tracks, frames, placed, address)
+    tracks = _shift_rows(tracks, rows, at_m, tuple(error[:, of_row] for error in drawn))
+    return _state_pose_covariance(tracks, rows, from_unit_m, placed) if placed.stated else tracks
 
 
-def _shift_rows(seen: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) -> Tracks:
+def _shift_rows(tracks: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) -> Tracks:
     """Some rows (K,) shifted and turned about `at_m` (2, K), by `off`: east, north (m) and turn (rad), (S, K) each."""
     east_m, north_m, turn_rad = off
-    shape = (len(turn_rad), len(seen.frame_ix))
-    columns: dict[str, Any] = {name: np.array(np.broadcast_to(getattr(seen, name), shape)) for name in _MOVED}
+    shape = (len(turn_rad), len(tracks.frame_ix))
+    columns: dict[str, Any] = {name: np.array(np.broadcast_to(getattr(tracks, name), shape)) for name in _MOVED}
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     dx_m, dy_m = columns["x_m"][:, rows] - at_m[0], columns["y_m"][:, rows] - at_m[1]
     # Written so that without shift and turn no bit changes.
@@ -317,40 +317,40 @@ def _shift_rows(seen: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) ->
     columns["yaw_rad"][:, rows] = wrap_angles(columns["yaw_rad"][:, rows] + turn_rad)
     vx_mps, vy_mps = columns["vx_mps"][:, rows], columns["vy_mps"][:, rows]
     columns["vx_mps"][:, rows], columns["vy_mps"][:, rows] = cos * vx_mps - sin * vy_mps, sin * vx_mps + cos * vy_mps
-    return replace(seen, **columns)
+    return replace(tracks, **columns)
 
 
 _MOVED = ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps")
 
 
-def _state_pose_covariance(seen: Tracks, rows: Int, from_unit_m: Float, placed: PoseError) -> Tracks:
+def _state_pose_covariance(tracks: Tracks, rows: Int, from_unit_m: Float, placed: PoseError) -> Tracks:
     """The rows with J Σ Jᵀ of the pose added to their stated covariances, J = [1 | (−dy, dx)] of the true geometry."""
     position_m2, turn_rad2 = placed.position_sigma_m**2, np.deg2rad(placed.yaw_sigma_deg) ** 2
     dx_m, dy_m = from_unit_m
-    more: dict[str, Any] = {
+    columns: dict[str, Any] = {
         "cov_ee_m2": position_m2 + turn_rad2 * dy_m**2,
         "cov_en_m2": -turn_rad2 * dx_m * dy_m,
         "cov_nn_m2": position_m2 + turn_rad2 * dx_m**2,
         "yaw_var_rad2": np.full(len(rows), turn_rad2),
     }
-    for name, added in more.items():
-        stated = getattr(seen, name)
-        more[name] = np.zeros((1, len(seen.frame_ix))) if stated is None else stated.copy()
-        more[name][:, rows] += added
-    return replace(seen, **more)
+    for name, added in columns.items():
+        stated = getattr(tracks, name)
+        columns[name] = np.zeros((1, len(tracks.frame_ix))) if stated is None else stated.copy()
+        columns[name][:, rows] += added
+    return replace(tracks, **columns)
 
 
 def _draw_pose_errors(
-    scene: Scene, seen: Tracks, frames: Int, placed: PoseError, address: tuple[int, str, Int]
+    scene: Scene, tracks: Tracks, frames: Int, placed: PoseError, address: tuple[int, str, Int]
 ) -> tuple[Float, Float, Float]:
     """Easting, northing (m) and heading (rad) of some lists of a unit: (S, K) each. `address`: seed, unit, runs."""
     seed, name, runs = address
-    unit_frames = np.flatnonzero(seen.frame_unit_ix == seen.units.index(name))
+    unit_frames = np.flatnonzero(tracks.frame_unit_ix == tracks.units.index(name))
     lists = ListStamps(
-        seen.stamp_ns[unit_frames], np.zeros(len(unit_frames), dtype=np.int64), np.searchsorted(unit_frames, frames)
+        tracks.stamp_ns[unit_frames], np.zeros(len(unit_frames), dtype=np.int64), np.searchsorted(unit_frames, frames)
     )
     of_unit = np.zeros(len(frames), dtype=np.int64)
-    random_key = drop_unshared(RandomKey((name,), of_unit, of_unit.astype(np.uint64), seen.stamp_ns[frames]), "unit")
+    random_key = drop_unshared(RandomKey((name,), of_unit, of_unit.astype(np.uint64), tracks.stamp_ns[frames]), "unit")
     draws = UnitDraws(CounterRng(seed, scene.log), random_key, lists, runs)
     east, north, yaw = (draws.normal(f"placed {what}", placed.parts) for what in ("east", "north", "yaw"))
     sigma_m, sigma_rad = placed.position_sigma_m, np.deg2rad(placed.yaw_sigma_deg)
@@ -381,18 +381,18 @@ def clock_errors_s(
 # Outages: for a while a unit makes no list at all, not even an empty one.
 
 
-def remove_outages(scene: Scene, seen: Tracks, setup: PerceptionSetup, runs: Int) -> Tracks:
+def remove_outages(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Tracks:
     """The lists of the units in one run, runs (1,), without those that are not made: they never arrive."""
-    down = lists_not_made(scene, seen, setup, runs)
+    down = lists_not_made(scene, tracks, setup, runs)
     if down is None:
-        return seen
+        return tracks
     [missing] = down
-    arrives_s = np.where(missing, np.inf, seen.arrives_s)
-    return replace(seen, arrives_s=arrives_s, valid=seen.valid & ~missing[seen.frame_ix])
+    arrives_s = np.where(missing, np.inf, tracks.arrives_s)
+    return replace(tracks, arrives_s=arrives_s, valid=tracks.valid & ~missing[tracks.frame_ix])
 
 
 def lists_not_made(scene: Scene, tracks: Tracks, setup: PerceptionSetup, runs: Int) -> Bool | None:
-    """(S, F) lists of `tracks` that are not made in the runs (S,), as their unit is down; None: all are made."""
+    """(S, F) lists of `tracks` that are missing in the runs (S,), as their unit is down; None: all are made."""
     outages_by_unit = {
         name: unit.outages for name, unit in setup.units.items() if unit.outages is not None and name in tracks.units
     }

@@ -112,7 +112,7 @@ def offset_places(x_m: Float, y_m: Float, heading_rad: Float, offset_m: tuple[fl
 
 
 def make_observers(places: Sequence[UnitPoses], carriers: Int) -> Observers:
-    """Units at the lists of one world, as visibility takes them; `carriers (U,)`: object indices, −1: none."""
+    """Units at the lists of one world, in the form that visibility takes; `carriers (U,)`: object indices, −1: none."""
     return Observers(
         np.stack([np.stack([p.x_m, p.y_m, p.z_m], axis=-1) for p in places]),
         np.stack([p.present for p in places]),
@@ -166,7 +166,7 @@ def find_grounds(truth: Tracks, outlines: Sequence[Any] | NDArray[np.object_]) -
 
 
 def _nearest_candidates(x_m: Float, y_m: Float, corners: Float) -> Int:
-    """The states (R,) that may be nearest: their distance from the corners' bounds is within the least from a corner.
+    """Indices (R,) of the states that may be nearest to a polygon: all others are farther from its bounding box.
 
     To build a geometry of a state takes most of the time, and most states are farther away.
     """
@@ -203,7 +203,7 @@ def _make_solid(truth: Tracks, k: int, obstacle: Obstacle, far_m: dict[str, floa
 
 
 def make_solid_statics(solids: Sequence[Solid]) -> Statics:
-    """Solids as visibility takes them."""
+    """Solids in the form that visibility takes."""
     if not solids:
         return NO_STATICS
     bottoms_m, heights_m = zip(*((solid.bottom_m, solid.height_m) for solid in solids), strict=True)
@@ -219,7 +219,7 @@ def _hides_from_m(solid: Solid) -> float:
 def find_enclosing_solid(
     scene: Scene, truth: Tracks, unit: Placement, obstacles: tuple[Obstacle, ...]
 ) -> tuple[Solid, float] | None:
-    """The solid that a fixed unit is in, and its distance (m) from the nearest face; None: it is in none."""
+    """The solid around a fixed unit, and the unit's distance (m) from the nearest face; None: it is in none."""
     import shapely
 
     if unit.at is None or unit.height_m is None:
@@ -251,14 +251,14 @@ def find_enclosing_solid(
 
 
 def _ground_or_assumed(
-    truth: Tracks, given_m: float | None, corners: Float, what: str, far_m: dict[str, float] | None
+    truth: Tracks, given_m: float | None, corners: Float, label: str, far_m: dict[str, float] | None
 ) -> float:
-    """Ground of corners (K, 2): as given, or of the nearest object, noted in `far_m` as `what` where it is far."""
+    """Ground of corners (K, 2): as given, or of the nearest object, noted in `far_m` as `label` where it is far."""
     if given_m is not None:
         return given_m
     ground_m, distance_m = find_ground(truth, corners)
     if far_m is not None and distance_m > FAR_GROUND_M:
-        far_m[what] = distance_m
+        far_m[label] = distance_m
     return ground_m
 
 

@@ -25,7 +25,7 @@ NO_UNIT, OUT_OF_VIEW, HIDDEN, IN_SIGHT = range(1, 5)
 
 
 def judge_sight(pem: str, experiment: PerceptionSetup, view: ViewGeometry, tags: Mapping[str, str]) -> Int:
-    """(P,) what a unit with this PEM has of the objects of a view: out of range or view, hidden, or in sight.
+    """(P,) the state of each object of a view for a unit with this PEM: out of range or view, hidden, or in sight.
 
     In sight: some of it shows, and its couple lists it with any probability. Hidden: it would, were nothing between.
     A visible share of NaN, where no couple can apply at any share, is out of view.
@@ -55,7 +55,7 @@ class SightSpans:
     state: Int
 
     def of_units(self, units: Collection[int]) -> SightSpans:
-        """The spans of some units together, in each the best of their states."""
+        """The spans of some units combined: at each instant the best of their states."""
         rows = np.flatnonzero(np.isin(self.unit_ix, list(units)))
         steps = np.zeros((len(rows), IN_SIGHT + 1), dtype=np.int64)
         steps[np.arange(len(rows)), self.state[rows]] = 1
@@ -69,13 +69,13 @@ class SightSpans:
         return SightSpans(np.full(kept.sum(), -1), episode_ix[kept], at_s[kept], end_s[kept], state[kept])
 
     def first_s(self, state: int, episodes: int) -> Float:
-        """(M,) when each of so many episodes is first in a state; NaN: never."""
+        """(M,) the first time of each episode in a state; NaN: never."""
         rows, first_s = self.state == state, np.full(episodes, np.inf)
         np.minimum.at(first_s, self.episode_ix[rows], self.begin_s[rows])
         return np.where(np.isfinite(first_s), first_s, np.nan)
 
     def seconds(self, state: int, episode_ix: Int, until_s: Float) -> Float:
-        """(n,) how long episodes (n,) are in a state until an instant each."""
+        """(n,) seconds that episodes (n,) are in a state until an instant each."""
         spans = self.episode_ix[rows := np.flatnonzero(self.state == state)]
         first, after = (np.searchsorted(spans, episode_ix, side=side) for side in ("left", "right"))
         count = after - first
@@ -86,7 +86,7 @@ class SightSpans:
 
 
 class SightChanges(NamedTuple):
-    """The lists (K,) of units in which the state of an episode is another than in the unit's list before."""
+    """The lists (K,) of units in which the state of an episode differs from that in the unit's list before."""
 
     unit_ix: Int
     episode_ix: Int
@@ -94,7 +94,7 @@ class SightChanges(NamedTuple):
     state: Int
 
     def take(self, rows: Int) -> SightChanges:
-        """Some of them."""
+        """The changes at these rows."""
         return SightChanges(self.unit_ix[rows], self.episode_ix[rows], self.captured_s[rows], self.state[rows])
 
 
@@ -155,15 +155,15 @@ def measure_sight(
     if names is None or any(name not in experiment.modelled for name in names):
         return SightTimes(*np.full((3, 1, episodes), np.nan))
     modelled, every = list(experiment.modelled), list(experiment.units)
-    patterns, which = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
-    runs = max(len(until_s), len(which))
-    until_s, which = np.broadcast_to(until_s, (runs, episodes)), np.broadcast_to(which.ravel(), runs)
+    patterns, pattern_ix = np.unique(equipped[:, [every.index(name) for name in names]], axis=0, return_inverse=True)
+    runs = max(len(until_s), len(pattern_ix))
+    until_s, pattern_ix = np.broadcast_to(until_s, (runs, episodes)), np.broadcast_to(pattern_ix.ravel(), runs)
     times = np.empty((3, runs, episodes))
     for k, there in enumerate(patterns):
-        own = spans.of_units({modelled.index(name) for name, present in zip(names, there, strict=True) if present})
-        of = np.flatnonzero(which == k)
-        each, then_s = np.tile(np.arange(episodes), len(of)), until_s[of].ravel()
-        times[0, of] = own.first_s(IN_SIGHT, episodes)
+        group = spans.of_units({modelled.index(name) for name, present in zip(names, there, strict=True) if present})
+        run_ix = np.flatnonzero(pattern_ix == k)
+        episode, then_s = np.tile(np.arange(episodes), len(run_ix)), until_s[run_ix].ravel()
+        times[0, run_ix] = group.first_s(IN_SIGHT, episodes)
         for row, state in enumerate((OUT_OF_VIEW, HIDDEN), start=1):
-            times[row, of] = own.seconds(state, each, then_s).reshape(len(of), episodes)
+            times[row, run_ix] = group.seconds(state, episode, then_s).reshape(len(run_ix), episodes)
     return SightTimes(*times)

@@ -83,11 +83,11 @@ def cut_convex(polygon: shapely.Polygon) -> list[Float]:
     rings = {k: [(x, y) for x, y in _corners_of(triangle)] for k, triangle in enumerate(triangles)}
     owner = {edge: k for k, ring in rings.items() for edge in _edges_of(ring)}
     for a, b in [(a, b) for a, b in owner if a < b and (b, a) in owner]:
-        one, other = owner[a, b], owner[b, a]
-        merged = _merge_rings(rings[one], rings[other], a, b) if one != other else None
+        first_ix, second_ix = owner[a, b], owner[b, a]
+        merged = _merge_rings(rings[first_ix], rings[second_ix], a, b) if first_ix != second_ix else None
         if merged is not None:
-            rings[one] = merged
-            owner |= dict.fromkeys(_edges_of(rings.pop(other)), one)
+            rings[first_ix] = merged
+            owner |= dict.fromkeys(_edges_of(rings.pop(second_ix)), first_ix)
     return [_corners_of(shapely.Polygon(ring).convex_hull) for ring in rings.values()]
 
 
@@ -104,10 +104,10 @@ def _edges_of(ring: list[_Corner]) -> list[tuple[_Corner, _Corner]]:
     return list(zip(ring, ring[1:] + ring[:1], strict=True))
 
 
-def _merge_rings(one: list[_Corner], other: list[_Corner], a: _Corner, b: _Corner) -> list[_Corner] | None:
+def _merge_rings(ring_a: list[_Corner], ring_b: list[_Corner], a: _Corner, b: _Corner) -> list[_Corner] | None:
     """Two convex rings without the edge a–b that both have; None: they are not convex together."""
-    start, end = one.index(b), other.index(a)
-    first, second = one[start:] + one[:start], other[end:] + other[:end]  # b … a, and a … b
+    start, end = ring_a.index(b), ring_b.index(a)
+    first, second = ring_a[start:] + ring_a[:start], ring_b[end:] + ring_b[:end]  # b … a, and a … b
     if not _turns_left(first[-2], a, second[1]) or not _turns_left(second[-2], b, first[1]):
         return None
     return first + second[1:-1]
@@ -158,9 +158,9 @@ class _BuiltInModel(VisibilityModel):
 
     flat: ClassVar[bool]
 
-    def shares(self, world: Tracks, static: Statics, observers: Observers, asked: Bool | None = None) -> Float:
+    def shares(self, world: Tracks, static: Statics, observers: Observers, needed: Bool | None = None) -> Float:
         order, _bounds = world.by_frame
-        seen, _blocker = _compute_views(world, static, observers, asked, flat=self.flat, blockers=False)
+        seen, _blocker = _compute_views(world, static, observers, needed, flat=self.flat, blockers=False)
         shares = np.empty_like(seen)
         shares[:, order] = seen
         return shares
@@ -222,32 +222,32 @@ Visibility = Annotated[
 
 
 def visible_shares(
-    world: Tracks, static: Statics, observers: Observers, model: VisibilityModel, asked: Bool | None = None
+    world: Tracks, static: Statics, observers: Observers, model: VisibilityModel, needed: Bool | None = None
 ) -> Float:
     """Visible share of every row of the world from every unit: (U, P); NaN where the unit is absent or the carrier.
 
-    `asked (U, P)`: those to compute, the others may be NaN; None: all. A model of the user's own gives all. Raises
+    `needed (U, P)`: those to compute, the others may be NaN; None: all. A model of the user's own gives all. Raises
     InputError where one fails, or gives no shares.
     """
     expected = (len(observers.carrier_ix), len(world.frame_ix))
     if not expected[1]:  # a model is not asked about no rows
         return np.zeros(expected)
     if isinstance(model, _BuiltInModel) and not is_own(type(model)):
-        return model.shares(world, static, observers, asked)
+        return model.shares(world, static, observers, needed)
     shares = ask_component(model, "visibility", lambda: np.asarray(model.shares(world, static, observers), dtype=float))
     if shares.shape != expected:
         raise wrong_answer_error(
             model, "visibility", f"shares: expected shape {expected}, found {shares.shape}", "shares"
         )
-    seen = observers.present[:, world.frame_ix] & (world.row_object_ix != observers.carrier_ix[:, None])
-    beyond = seen & ~((shares >= 0) & (shares <= 1 + 1e-12))
-    if beyond.any():
-        raise wrong_answer_error(model, "visibility", f"shares: expected 0 … 1, found {shares[beyond][0]}", "shares")
-    return np.where(seen, shares, np.nan)
+    viewed = observers.present[:, world.frame_ix] & (world.row_object_ix != observers.carrier_ix[:, None])
+    invalid = viewed & ~((shares >= 0) & (shares <= 1 + 1e-12))
+    if invalid.any():
+        raise wrong_answer_error(model, "visibility", f"shares: expected 0 … 1, found {shares[invalid][0]}", "shares")
+    return np.where(viewed, shares, np.nan)
 
 
 def find_blockers(world: Tracks, static: Statics, observers: Observers, model: VisibilityModel) -> Int:
-    """Which body alone would hide most of each row of the world from each unit: (U, P), a row of the world.
+    """The body that alone hides most of each row of the world from each unit: (U, P), a row of the world.
 
     −1: none hides any of it; −2 − k: the obstacle k. Raises InputError where a model of the user's own fails.
     """
@@ -265,7 +265,7 @@ def find_blockers(world: Tracks, static: Statics, observers: Observers, model: V
 
 
 def _compute_views(
-    world: Tracks, static: Statics, observers: Observers, asked: Bool | None, *, flat: bool, blockers: bool
+    world: Tracks, static: Statics, observers: Observers, needed: Bool | None, *, flat: bool, blockers: bool
 ) -> tuple[Float, Int]:
     """Shares and blockers (U, P), rows list by list; blockers empty unless wanted."""
     order, bounds = world.by_frame
@@ -278,9 +278,9 @@ def _compute_views(
     boxes = Boxes(bounds, box_corners(world)[order], z - half, z + half, world.row_object_ix[order])
     place_m, present = np.ascontiguousarray(observers.place_m), np.ascontiguousarray(observers.present)
     places = Observers(place_m, present, observers.carrier_ix)
-    if asked is None:
-        asked = np.ones(out.shape, dtype=bool)
-    wanted = np.ascontiguousarray(asked[:, order])
+    if needed is None:
+        needed = np.ones(out.shape, dtype=bool)
+    needed_rows = np.ascontiguousarray(needed[:, order])
     threads = min(8, os.cpu_count() or 1)
     pieces = max(1, min(4 * threads, n_units * len(order) // _ROWS_PER_THREAD, n_frames))
     # Cuts with about as many rows each, so that threads end together.
@@ -290,7 +290,7 @@ def _compute_views(
         list(
             pool.map(
                 lambda k: call_in_room(
-                    compute_shares, edges[k], edges[k + 1], boxes, static, places, wanted, flat, out, blocker
+                    compute_shares, edges[k], edges[k + 1], boxes, static, places, needed_rows, flat, out, blocker
                 ),
                 range(pieces),
             )

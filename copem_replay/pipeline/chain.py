@@ -29,10 +29,7 @@ from copem_replay.pipeline.world import Transmission
 
 
 def fuse_members(log: Replay, experiment: Experiment, group: RunGroup, *, entries: bool = True) -> Replay:
-    """The log in the one run of a group, in which the lists of the units that fuse are recorded ones.
-
-    `entries=False`: when there are lists is enough; nothing is fused.
-    """
+    """The log in the one run of a group, with the lists of fusing units as recorded ones; empty without `entries`."""
     units = log.expand(experiment)
     if not units.fusing:
         return log
@@ -91,7 +88,7 @@ def _find_lists(name: str, schedule: FusionSchedule, stamp_ns: Int, scene: Scene
 
 def _list_fused(lists: Tracks, tracks: FusedTracks, scene: Scene) -> RecordedUnits:
     """The fused lists of one run as the lists of a unit, with the object that each entry holds."""
-    fused, said = tracks.fused, tracks.said
+    fused, claims = tracks.fused, tracks.said
     rows = fused.by_frame[0][fused.valid[0, fused.by_frame[0]]]
     object_ix = fused.row_object_ix[rows]
     if tracks.second_of is not None:
@@ -102,9 +99,9 @@ def _list_fused(lists: Tracks, tracks: FusedTracks, scene: Scene) -> RecordedUni
         lists, start=np.arange(len(rows) + 1), unit_ix=np.zeros(len(rows), dtype=np.int64), object_ix=object_ix,
         frame_ix=fused.frame_ix[rows], valid=np.ones((1, len(rows)), dtype=bool), **states,
     )  # fmt: skip
-    if said is not None:
+    if claims is not None:
         return RecordedUnits(
-            listed, *(np.array(said[what][rows]) for what in ("existence", "class_probability", "track_id"))
+            listed, *(np.array(claims[what][rows]) for what in ("existence", "class_probability", "track_id"))
         )
     certain = np.eye(len(CLASSES))[scene.object_class[object_ix]]
     return RecordedUnits(listed, np.ones(len(rows)), certain, np.full(len(rows), -1))

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 def find_lasting_detection(
     replay: Replay, experiment: ExpandedExperiment, name: str, received: Tracks
 ) -> LastingDetection | None:
-    """How the detection of each row (P,) lasts in what a configuration hears; None: no detection lasts.
+    """How the detection of each row (P,) lasts, of all lists that a configuration receives; None: no detection lasts.
 
     Raises ExperimentError where detection lasts in a way that has no closed form.
     """
@@ -151,7 +151,7 @@ def _refuse_lasting(name: str, why: str, log: str = "") -> ExperimentError:
 
 
 def receive_without_loss(replay: Replay, experiment: ExpandedExperiment, name: str, hits: int) -> tuple[Tracks, Float]:
-    """What reaches the receiver of a configuration if no list is lost, and the probability that each (F,) is not.
+    """The lists that reach a configuration's receiver if none is lost, and the probability (F,) that each is not lost.
 
     `hits`: how many confirm an object. Raises ExperimentError where drawn arrivals have no closed form.
     """
@@ -161,39 +161,41 @@ def receive_without_loss(replay: Replay, experiment: ExpandedExperiment, name: s
             why = "`ready` is drawn, and then lists have no common instants; make it constant"
             raise _refuse_link(name, f"unit {unit}: {why}")
     of_truth = configuration.units == TRUTH
-    seen = replay.truth if of_truth else replay.measured.tracks
+    lists = replay.truth if of_truth else replay.measured.tracks
     if not of_truth:
         rng = CounterRng(experiment.seed, replay.scene.log)
-        seen = delay_until_ready(seen, experiment.ready, rng, np.zeros(1, dtype=np.int64))
-    reception = np.ones(len(seen.stamp_ns))
+        lists = delay_until_ready(lists, experiment.ready, rng, np.zeros(1, dtype=np.int64))
+    reception = np.ones(len(lists.stamp_ns))
     lossless: list[UnitLinks] = []
     for unit_links in experiment.links_of(name):
         if unit_links.link.drawn:
             assert isinstance(unit_links.link, Radio)  # links of the user's own are not drawn
             _check_link(unit_links, unit_links.link, name, hits)
-            share = _reception_probability(replay, seen, unit_links, unit_links.link, name)
+            share = _reception_probability(replay, lists, unit_links, unit_links.link, name)
             if unit_links.units is not None:
-                concerned = np.array([unit in unit_links.units for unit in seen.units], dtype=bool)[seen.frame_unit_ix]
+                concerned = np.array([unit in unit_links.units for unit in lists.units], dtype=bool)[
+                    lists.frame_unit_ix
+                ]
                 share = np.where(concerned, share, 1.0)
             reception *= share
             unit_links = replace(unit_links, link=unit_links.link.model_copy(update={"reception": ConstantReception()}))
         lossless.append(unit_links)
-    return sample_arrivals(transmit(seen, lossless, None if of_truth else units), configuration.issue_hz), reception
+    return sample_arrivals(transmit(lists, lossless, None if of_truth else units), configuration.issue_hz), reception
 
 
 def _check_link(unit_links: UnitLinks, link: Radio, name: str, hits: int) -> None:
-    which = f"link {unit_links.where.removeprefix('links.')}"
+    label = f"link {unit_links.where.removeprefix('links.')}"
     if link.latency.fixed_s is None:
         raise _refuse_link(
-            name, f"{which}: latency is drawn, and then lists have no common instants; use a constant one"
+            name, f"{label}: latency is drawn, and then lists have no common instants; use a constant one"
         )
     if link.channel is not None:
-        raise _refuse_link(name, f"{which}: lists queue, each as long as the lists before it are; use no `channel`")
+        raise _refuse_link(name, f"{label}: lists queue, each as long as the lists before it are; use no `channel`")
     if link.memory.get("reception"):
-        raise _refuse_link(name, f"{which}: losses last, and lists are then lost together; use no `memory`")
+        raise _refuse_link(name, f"{label}: losses last, and lists are then lost together; use no `memory`")
     if hits > 1:
         why = "a lost list is no capture to the receiver, and confirmation by several hits then has no closed form"
-        raise _refuse_link(name, f"{which}: {why}; confirm with one hit")
+        raise _refuse_link(name, f"{label}: {why}; confirm with one hit")
 
 
 def _reception_probability(replay: Replay, seen: Tracks, unit_links: UnitLinks, link: Radio, name: str) -> Float:
@@ -224,7 +226,7 @@ def _refuse_link(name: str, why: str) -> ExperimentError:
 
 
 def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
-    """The rows of `exact.parquet` of one log: per configuration and object, how probable each time of detection is.
+    """The rows of `exact.parquet` of one log: the probability of each time of detection, by configuration and object.
 
     Raises ExperimentError for a configuration that has no closed form.
     """
@@ -236,7 +238,7 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
             f"{replay.scene.log}: exact: perceived conflicts depend on sampled errors, and `brakes_for: "
             "conflict` has no closed form; use `brakes_for: object`, or leave `exact` out"
         )
-    _check_truth_ids(experiment)
+    _check_known_probabilities(experiment)
     parts = []
     for name in experiment.configurations:
         columns = _exact_columns(replay, experiment, name, compute_distributions(replay, experiment, name))
@@ -246,8 +248,8 @@ def exact_table(replay: Replay, experiment: Experiment) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def _check_truth_ids(experiment: Experiment) -> None:
-    """Raises ExperimentError for a configuration whose probabilities of detection are not known."""
+def _check_known_probabilities(experiment: Experiment) -> None:
+    """Raises ExperimentError for a configuration whose probabilities of detection have no closed form."""
     facts = find_facts(experiment)
     for name, configuration in experiment.configurations.items():
         recorded = set(experiment.units_of(configuration)) & experiment.recorded.keys()
@@ -270,7 +272,7 @@ def check_exact(ready: Sequence[Replay], experiment: Experiment) -> None:
     """Raises ExperimentError where exact times are asked for of a configuration that has no closed form."""
     if not experiment.measure.exact:
         return
-    _check_truth_ids(experiment)
+    _check_known_probabilities(experiment)
     hits = experiment.measure.confirm.hits
     for replay in ready:
         units = replay.expand(resolve_for_log(experiment, replay.scene.log))
@@ -367,15 +369,15 @@ def _exact_columns(
 ) -> dict[str, Any]:
     """Columns of one configuration: a row per episode and instant, and one without an instant for never."""
     scene, episodes = replay.scene, replay.episodes
-    episode = np.repeat(np.arange(len(distributions)), [len(of.time_s) + 1 for of in distributions])
+    episode = np.repeat(np.arange(len(distributions)), [len(d.time_s) + 1 for d in distributions])
 
     def rows(pieces: Iterable[Float]) -> Float:
         return np.concatenate([np.empty(0), *pieces])
 
     def of_never(values: Iterable[float]) -> Float:
-        return rows(np.append(np.full(len(of.time_s), np.nan), v) for of, v in zip(distributions, values, strict=True))
+        return rows(np.append(np.full(len(d.time_s), np.nan), v) for d, v in zip(distributions, values, strict=True))
 
-    detection_s = rows(np.append(of.time_s, np.nan) for of in distributions)
+    detection_s = rows(np.append(d.time_s, np.nan) for d in distributions)
     object_ix = episodes.object_ix[episode]
     distance_m, gap_m = measure_distances(scene, replay.truth, experiment, object_ix, detection_s)
     return {
@@ -388,11 +390,11 @@ def _exact_columns(
         "onset_s": episodes.onset_s[episode],
         "began": began_texts(episodes.began[episode]),
         "detection_s": detection_s,
-        "probability": rows(np.append(of.probability, np.exp(of.log_never)) for of in distributions),
-        "incidence": rows(np.append(np.minimum(np.cumsum(of.probability), 1), np.nan) for of in distributions),
-        "miss_log10": of_never(_log10(of.log_never) for of in distributions),
-        "miss_per_logit": of_never(of.per_logit for of in distributions),
-        "miss_log10_half_odds": of_never(_log10(of.log_never_half) for of in distributions),
+        "probability": rows(np.append(d.probability, np.exp(d.log_never)) for d in distributions),
+        "incidence": rows(np.append(np.minimum(np.cumsum(d.probability), 1), np.nan) for d in distributions),
+        "miss_log10": of_never(_log10(d.log_never) for d in distributions),
+        "miss_per_logit": of_never(d.per_logit for d in distributions),
+        "miss_log10_half_odds": of_never(_log10(d.log_never_half) for d in distributions),
         "time_to_detection_s": detection_s - episodes.onset_s[episode],
         "distance_at_detection_m": distance_m,
         "gap_at_detection_m": gap_m,

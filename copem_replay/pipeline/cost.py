@@ -37,7 +37,7 @@ LONG_S = 10.0
 
 @dataclass
 class RunCost:
-    """Seconds of a run: all of it, and what its workers did, of which some was measuring accuracy.
+    """Seconds of a run: of all of it, of its workers, and of these what measured accuracy.
 
     `compiled`: kernels had to be compiled, so the next run takes less.
     """
@@ -61,7 +61,7 @@ class RunCost:
         )
 
     def add(self, in_blocks_s: float, outcomes: Sequence[BlockOutcome]) -> None:
-        """Take in blocks that were computed within `in_blocks_s` seconds."""
+        """Add the seconds of blocks that were computed within `in_blocks_s`."""
         self.in_blocks_s += in_blocks_s
         self.worked_s += sum(outcome.worked_s for outcome in outcomes)
         self.accuracy_s += sum(outcome.accuracy_s for outcome in outcomes)
@@ -92,21 +92,21 @@ Size: TypeAlias = tuple[int, int]
 
 
 def estimate_size(replay: Replay) -> Size:
-    """The rows that one run of a log gives, and how often units look at measured objects."""
+    """Estimated rows of one run of a log, and how often units look at measured objects."""
     experiment, measured = replay.expanded, replay.episodes.object_ix
     states = int(np.diff(replay.truth.start)[np.isin(replay.truth.object_ix, measured)].sum())
     return len(measured) * len(experiment.configurations), states * len(experiment.modelled)
 
 
-def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequence[Size] = ()) -> list[str]:
+def memory_notes(ready: Sequence[Replay], experiment: Experiment, other_sizes: Sequence[Size] = ()) -> list[str]:
     """A note where the runs may take more memory than is free. Raises ExperimentError where they certainly do.
 
-    `others`: sizes of further logs.
+    `other_sizes`: sizes of further logs.
     """
-    sizes, free, runs = [*map(estimate_size, ready), *others], free_bytes(), experiment.runs
+    sizes, free, runs = [*map(estimate_size, ready), *other_sizes], free_bytes(), experiment.runs
     rows_a_run = sum(rows for rows, _ in sizes)
-    about = rows_a_run * ABOUT_BYTES * runs + max((views for _, views in sizes), default=0) * OBSERVED_BYTES
-    if free is None or about <= free:
+    expected_bytes = rows_a_run * ABOUT_BYTES * runs + max((views for _, views in sizes), default=0) * OBSERVED_BYTES
+    if free is None or expected_bytes <= free:
         return []
     rows = f"{runs} runs of {rows_a_run} {'row' if rows_a_run == 1 else 'rows'} each"
     least = rows_a_run * AT_LEAST_BYTES[experiment.measure.accuracy] * runs
@@ -115,7 +115,7 @@ def memory_notes(ready: Sequence[Replay], experiment: Experiment, others: Sequen
         raise ExperimentError(
             f"{rows} take at least {_format_gb(least)}, and {_format_gb(free)} are free; take {few} or fewer"
         )
-    return [f"{rows} may take {_format_gb(about)}, and {_format_gb(free)} are free"]
+    return [f"{rows} may take {_format_gb(expected_bytes)}, and {_format_gb(free)} are free"]
 
 
 def free_bytes() -> int | None:
@@ -147,7 +147,7 @@ def _free_process_bytes() -> int | None:
 
 
 def peak_bytes() -> int | None:
-    """The most memory that this process had at a time; None: the system does not say."""
+    """The peak memory of this process; None: the system does not say."""
     if resource is None:
         peak_wset: int | None = getattr(psutil.Process().memory_info(), "peak_wset", None)  # Windows
         return peak_wset

@@ -39,7 +39,7 @@ E = TypeVar("E", bound=Experiment)
 
 @dataclass(frozen=True)
 class ConfigurationFacts:
-    """What a configuration is, as `provenance.json` has it.
+    """The properties of a configuration, as `provenance.json` states them.
 
     `truth`: its lists are the truth; `recorded`: they are the output of a stack. `by_truth_id`: objects are detected by
     truth id, not by match. `fixed`: detections are equal in every run; `fixed_verdicts`: and whether the ego passes.
@@ -61,7 +61,7 @@ class ConfigurationFacts:
 
 
 def find_facts(experiment: Experiment) -> dict[str, ConfigurationFacts]:
-    """What each configuration of an experiment is, by name.
+    """The properties of each configuration of an experiment, by name.
 
     Fixed by kind of unit: lists of the truth and of recorded units are not drawn; those of a unit with a PEM are, and
     so are its carriers, even where probabilities are 0 or 1. A driver's delay is drawn, except with the `constant`
@@ -112,14 +112,14 @@ def _find_ideal(experiment: Experiment, configuration: Configuration) -> tuple[s
     """
     if configuration.recorded is None and isinstance(configuration.fusion, IdealFusion):
         return None, None
-    own, same = _list_inputs(experiment, configuration), {}
+    own_inputs, candidates = _list_inputs(experiment, configuration), {}
     for name, other in experiment.configurations.items():
         if other.recorded is None and other.fusion == IdealFusion():
             inputs = _list_inputs(experiment, other)
-            if own[0] and inputs[0] == own[0]:
-                same[name] = inputs == own
-    alike = next((name for name, is_alike in same.items() if is_alike), None)
-    return alike or next(iter(same), None), None if not same else "units" if alike is None else "inputs"
+            if own_inputs[0] and inputs[0] == own_inputs[0]:
+                candidates[name] = inputs == own_inputs
+    alike = next((name for name, is_alike in candidates.items() if is_alike), None)
+    return alike or next(iter(candidates), None), None if not candidates else "units" if alike is None else "inputs"
 
 
 def _find_remembering(experiment: Experiment, configuration: Configuration) -> str | None:
@@ -180,12 +180,12 @@ class ExpandedExperiment(Experiment):
 
     @property
     def ready(self) -> dict[str, LatencyModel]:
-        """By unit the time from capture until a list can be sent, of those that state one."""
+        """Seconds from capture until a list can be sent, by unit that states a model of it."""
         return {name: unit.ready for name, unit in self.units.items() if unit.ready is not None}
 
     @property
     def sends(self) -> dict[str, Sends]:
-        """By unit the rules of what it sends, of those that do not send all of their lists."""
+        """The sending rules by unit, for units that do not send all of their lists."""
         return {name: unit.sends for name, unit in self.units.items() if unit.sends is not None}
 
     @property
@@ -198,17 +198,17 @@ class ExpandedExperiment(Experiment):
         return self.unit_links[name]
 
     def has_way(self, name: str) -> bool:
-        """Whether the way of a configuration's lists is measured, in the study."""
+        """Whether the study measures the way of a configuration's lists."""
         return name in self.ways
 
     def linked(self, name: str) -> list[str]:
-        """The units that send by a link in one of these configurations; TRUTH stands for the truth."""
+        """The units that send by a link in any of these configurations; TRUTH stands for the truth."""
         configuration = self.configurations[name]
         return [unit for unit in self.units_of(configuration) or (TRUTH,) if configuration.link_of(unit) is not None]
 
     @property
     def arrivals_differ(self) -> bool:
-        """Whether lists, or their arrivals, differ from run to run: each run then has receiver instants of its own."""
+        """Whether lists or their arrivals differ between runs: each run then has receiver instants of its own."""
         return (
             self.outages
             or bool(self.sends or self.fusing)
@@ -218,7 +218,7 @@ class ExpandedExperiment(Experiment):
 
     @property
     def runs_apart(self) -> bool:
-        """Whether runs are replayed one by one, as lists differ in more than the presence and states of their rows."""
+        """Whether runs are replayed one by one, as their lists differ in more than presence and states of rows."""
         return self.arrivals_differ or any(
             unit.clock is not None or (unit.pem is not None and self.pems[unit.pem].draws_claims)
             for configuration in self.configurations.values()
@@ -289,8 +289,8 @@ def _expand_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment
 
 
 def expand_alike(experiment: Experiment, other: ExpandedExperiment) -> ExpandedExperiment:
-    """An experiment with the units of another over one log, from which it differs in its configurations or in what is
-    measured. Raises ValueError where it has other units.
+    """An experiment with the units of another over one log; the two differ in configurations or in what is measured.
+    Raises ValueError where the units differ.
     """
     if isinstance(experiment, ExpandedExperiment):
         return experiment
@@ -322,15 +322,15 @@ def _replace_units(
 
 
 def expand_members(experiment: ExpandedExperiment) -> ExpandedExperiment:
-    """The experiment in which each unit that fuses is a configuration of its members, and no unit."""
-    kept = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
+    """The experiment with the members of each fusing unit as a configuration, and without that unit."""
+    keep = [k for k, unit in enumerate(experiment.units.values()) if unit.fuses is None]
     names = list(experiment.units)
     given = {name: getattr(experiment, name) for name in Experiment.model_fields}
     given["configurations"] = {name: unit.as_configuration() for name, unit in experiment.fusing.items()}
     return _replace_units(
         Experiment.model_construct(**given),
-        {names[k]: experiment.units[names[k]] for k in kept},
-        tuple(experiment.named[k] for k in kept), tuple(experiment.carrier[k] for k in kept), experiment.share[kept],
+        {names[k]: experiment.units[names[k]] for k in keep},
+        tuple(experiment.named[k] for k in keep), tuple(experiment.carrier[k] for k in keep), experiment.share[keep],
     )  # fmt: skip
 
 
@@ -357,7 +357,7 @@ def _relay_unit(configuration: Configuration, name: str, output: RecordedOutput)
 
 
 def resolve_for_run(experiment: Experiment, scene: Scene, run: int) -> Experiment:
-    """The experiment in one run: with the units that objects carry in this run."""
+    """The experiment in one run, with only the units that objects carry in it."""
     expanded = _expand_carriers(experiment, scene)  # `prepare_log` adds the outputs
     equipped = expanded.equipped(scene.log, np.array([run]))
     if equipped is None and expanded.units.keys() == experiment.units.keys():
@@ -376,14 +376,14 @@ def _replace_members(
     for name, configuration in configurations.items():
         changed: dict[str, object] = {}
         if not isinstance(configuration.units, str):
-            changed["units"] = tuple(one for unit in configuration.units for one in members[unit])
+            changed["units"] = tuple(member for unit in configuration.units for member in members[unit])
         if isinstance(configuration.latency_s, dict):
             changed["latency_s"] = {
-                one: value for unit, value in configuration.latency_s.items() for one in members.get(unit, [unit])
+                member: value for unit, value in configuration.latency_s.items() for member in members.get(unit, [unit])
             }
         if isinstance(configuration.link, dict):
             changed["link"] = {
-                one: link for unit, link in configuration.link.items() for one in members.get(unit, [unit])
+                member: link for unit, link in configuration.link.items() for member in members.get(unit, [unit])
             }
         result[name] = configuration.model_copy(update=changed)
     return result
@@ -412,14 +412,14 @@ class RunGroup:
 
 
 def group_runs(experiment: ExpandedExperiment, log: str, runs: Int, *, entries_alone: bool = False) -> list[RunGroup]:
-    """The runs (S,) in groups that have the same lists. `entries_alone`: only the entries of lists count."""
+    """The runs (S,) grouped by equal lists. `entries_alone`: only the entries of lists count."""
     everyone = RunGroup.of_all_units(experiment, runs)
     equipped = experiment.equipped(log, runs)
     if entries_alone and not experiment.arrivals_differ:
         return [everyone if equipped is None else replace(everyone, listing=equipped)]
-    patterns, which = everyone.listing, np.zeros(len(runs), dtype=np.int64)
+    patterns, pattern_ix = everyone.listing, np.zeros(len(runs), dtype=np.int64)
     if equipped is not None:
-        patterns, which = np.unique(equipped, axis=0, return_inverse=True)
+        patterns, pattern_ix = np.unique(equipped, axis=0, return_inverse=True)
     if experiment.runs_apart:
-        return [RunGroup(runs[s : s + 1], patterns[k][None], patterns[k]) for s, k in enumerate(which.tolist())]
-    return [RunGroup(runs[which == k], present[None], present) for k, present in enumerate(patterns)]
+        return [RunGroup(runs[s : s + 1], patterns[k][None], patterns[k]) for s, k in enumerate(pattern_ix.tolist())]
+    return [RunGroup(runs[pattern_ix == k], present[None], present) for k, present in enumerate(patterns)]

@@ -43,17 +43,17 @@ class FalseTracks:
         self._parts = list[tuple[Entries, Int, Int, Int]]()
         self._added = self._of_runs = 0
 
-    def add(self, lists: ObjectLists, about: Matches, now: Matches) -> None:
-        """Add the next lists, and what their entries are about at the instant that they tell of, and now."""
-        false = (about.role == GHOST) & (now.role == GHOST)
-        rows = np.flatnonzero(false & self._measured_class[about.class_ix])
+    def add(self, lists: ObjectLists, matches: Matches, now: Matches) -> None:
+        """Add the next lists, with the matches of their entries at the instant they tell of, and now."""
+        false = (matches.role == GHOST) & (now.role == GHOST)
+        rows = np.flatnonzero(false & self._measured_class[matches.class_ix])
         place = np.searchsorted(lists.start.ravel(), rows, side="right") - 1
         run_ix, list_ix = np.divmod(place, lists.start.shape[1])
         list_ix += self._added
         entries = take_entries(lists.entries, rows)
-        kept = are_annotated(entries["x_m"], entries["y_m"], list_ix, self._reference, self._settings)
-        kept &= self._reference.present[list_ix]
-        parts = entries[kept], about.class_ix[rows][kept].astype(np.int64), run_ix[kept], list_ix[kept]
+        keep = are_annotated(entries["x_m"], entries["y_m"], list_ix, self._reference, self._settings)
+        keep &= self._reference.present[list_ix]
+        parts = entries[keep], matches.class_ix[rows][keep].astype(np.int64), run_ix[keep], list_ix[keep]
         self._parts.append(parts)
         self._added, self._of_runs = self._added + lists.start.shape[1] - 1, len(lists.start)
 
@@ -88,18 +88,18 @@ def find_false_tracks(
     order = np.lexsort((entries["y_m"], entries["x_m"], list_ix, run_ix))
     entries, class_ix, run_ix, list_ix = entries[order], class_ix[order], run_ix[order], list_ix[order]
     number = np.full(len(order), -1)
-    alone = np.flatnonzero(entries["track_id"] < 0)
-    linked = np.full(len(alone), -1)
-    x_m, y_m = (np.ascontiguousarray(entries[name][alone]) for name in ("x_m", "y_m"))
-    _link_entries(run_ix[alone], list_ix[alone], issue_s[list_ix[alone]], x_m, y_m, linked, np.empty(len(alone), int))
-    number[alone] = -1 - linked
+    loose = np.flatnonzero(entries["track_id"] < 0)
+    linked = np.full(len(loose), -1)
+    x_m, y_m = (np.ascontiguousarray(entries[name][loose]) for name in ("x_m", "y_m"))
+    _link_entries(run_ix[loose], list_ix[loose], issue_s[list_ix[loose]], x_m, y_m, linked, np.empty(len(loose), int))
+    number[loose] = -1 - linked
     named = entries["track_id"] >= 0
     number[named] = entries["track_id"][named]
     track, (first, last) = _group_rows(run_ix, number)
     ends_s = np.minimum(np.append(issue_s[1:], np.inf), issue_s + max_age_s)
     existence = np.full(len(first), -np.inf)
     np.maximum.at(existence, track, entries["existence"])
-    found = pd.DataFrame({
+    table = pd.DataFrame({
         "run": run_ix[first],
         "begins_s": issue_s[list_ix[first]],
         "lasts_s": ends_s[list_ix[last]] - issue_s[list_ix[first]],
@@ -111,7 +111,7 @@ def find_false_tracks(
         **{name: entries[name][first] for name in ("x_m", "y_m")},
         **{f"to_{name}": entries[name][last] for name in ("x_m", "y_m")},
     })  # fmt: skip
-    return found.sort_values(list(SORTED), kind="stable", ignore_index=True)
+    return table.sort_values(list(SORTED), kind="stable", ignore_index=True)
 
 
 LISTED = 5
@@ -119,17 +119,17 @@ LISTED = 5
 
 
 def describe_false_tracks(rows: pd.DataFrame) -> str:
-    """In words the false tracks of a configuration in one run, the longest first, `LISTED` at most; `none`."""
+    """The false tracks of a configuration in one run in words, the longest first, at most `LISTED`; `none`."""
     import pandas as pd
 
     ranked = rows.iloc[np.lexsort((rows["begins_s"], -rows["lasts_s"].round(6)))]  # rounding decides nothing
-    told = [
+    parts = [
         f"{row.object_class} at ({row.x_m:.0f}, {row.y_m:.0f}) m from {row.begins_s:.1f} s on for {row.lasts_s:.2f} s"
         + ("" if pd.isna(row.units) else f", by {row.units}")
         for row in ranked[:LISTED].itertuples()
     ]
     more = [f"and {len(rows) - LISTED} more"] if len(rows) > LISTED else []
-    return "; ".join([*told, *more]) or "none"
+    return "; ".join([*parts, *more]) or "none"
 
 
 def _group_rows(run_ix: Int, number: Int) -> tuple[Int, tuple[Int, Int]]:
@@ -155,12 +155,12 @@ def _name_units(track: Int, unit_ix: Int, units: tuple[str, ...], tracks: int) -
 @borrowing_kernel
 def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Float, number: Int, newest: Int) -> None:
     # Out: the track of each entry (N,), by run and list. `newest`: of each track its last entry so far.
-    made, oldest, first = 0, 0, 0
+    n_tracks, oldest, first = 0, 0, 0
     while first < len(run_ix):
         after = first
         while after < len(run_ix) and run_ix[after] == run_ix[first] and list_ix[after] == list_ix[first]:
             after += 1
-        while oldest < made and (
+        while oldest < n_tracks and (
             run_ix[newest[oldest]] != run_ix[first] or time_s[first] - time_s[newest[oldest]] > PAUSE_S + SAME_INSTANT_S
         ):
             oldest += 1
@@ -168,7 +168,7 @@ def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Flo
         while nearest >= 0:
             least, nearest = NEAR_M * NEAR_M + 1e-9, -1
             for i in range(first, after):
-                for t in range(oldest, made):
+                for t in range(oldest, n_tracks):
                     j = newest[t]
                     too_late = time_s[first] - time_s[j] > PAUSE_S + SAME_INSTANT_S
                     if number[i] >= 0 or j >= first or run_ix[j] != run_ix[i] or too_late:
@@ -180,6 +180,6 @@ def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Flo
                 number[nearest], newest[before] = before, nearest
         for i in range(first, after):
             if number[i] < 0:
-                number[i], newest[made] = made, i
-                made += 1
+                number[i], newest[n_tracks] = n_tracks, i
+                n_tracks += 1
         first = after

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ListRate:
-    """The fused lists of one configuration: intervals between them, the seconds these cover, and what its links do."""
+    """The fused lists of one configuration: number of intervals, the seconds these cover, and what its links do."""
 
     intervals: int
     covered_s: float
@@ -231,18 +231,18 @@ def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
 def _find_empty_classes(recordings: Sequence[KnownLog], experiment: Experiment) -> Iterator[str]:
     """Measured classes that are named like their group and select nobody, though the group would: `vehicle`."""
     selects, others = Counter[str](), Counter[str]()  # by class, all logs together: the measured objects, and the rest
-    asked: dict[str, None] = {}
+    class_names: dict[str, None] = {}
     for recording in recordings:
         scene = recording.scene
         classes = resolve_for_log(experiment, scene.log).measure.objects.classes or ()
-        asked |= dict.fromkeys(classes)
+        class_names |= dict.fromkeys(classes)
         there = scene.object_class[np.arange(len(scene.object_class)) != scene.ego_ix]
         measured = np.isin(there, class_indices(classes))
         selects.update(CLASSES[k] for k in there[measured])
         others.update(CLASSES[k] for k in there[~measured])
     for group, members in CLASS_GROUPS.items():
         name, more = group.removesuffix("s"), ", ".join(f"{others[one]} {one}" for one in members if others[one])
-        if name in asked and name in CLASSES and not selects[name] and more:
+        if name in class_names and name in CLASSES and not selects[name] and more:
             yield f"measure.objects.classes: no object is a {name!r}; `{group}` would select {more}"
 
 
@@ -255,7 +255,7 @@ def _find_unused_memory(experiment: Experiment) -> Iterator[str]:
 
 
 def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = None) -> Iterator[str]:
-    """What is odd about a log in an experiment, a line each.
+    """The oddities of a log in an experiment, one line each.
 
     `met (U,)`: whether an object ever meets a condition of each modelled unit's PEM; None: judged by range, azimuth and
     class alone.
@@ -286,8 +286,8 @@ def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:
     Ideal fusion knows the true captures and ids although a clock is off, or a unit has ghosts.
     """
     for name, configuration in experiment.configurations.items():
-        fusion, own = configuration.fusion, experiment.units_of(configuration)
-        for unit in own:
+        fusion, unit_names = configuration.fusion, experiment.units_of(configuration)
+        for unit in unit_names:
             if _is_tracker(experiment.units[unit].fusion) and _is_tracker(fusion) and not fusion.common_share:
                 yield (
                     f"configuration {name}: the errors of {unit}'s lists, which a tracker makes, hang together; its "
@@ -295,7 +295,7 @@ def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:
                 )
         if not isinstance(fusion, IdealFusion):
             continue
-        units = {unit: experiment.units[unit] for unit in (*own, *experiment.list_sensing(own))}
+        units = {unit: experiment.units[unit] for unit in (*unit_names, *experiment.list_sensing(unit_names))}
         off = [unit for unit, made in units.items() if made.clock is not None]
         if off:
             yield f"configuration {name}: ideal fusion uses true captures, ignoring clock errors of {', '.join(off)}"
@@ -320,11 +320,11 @@ def _find_dead_links(replay: Replay, experiment: Experiment) -> Iterator[str]:
     best_of: dict[tuple[str, str], float] = {}
     for name, configuration in units.configurations.items():
         members = units.units_of(configuration) or (TRUTH,)
-        for of in units.links_of(name):
-            if isinstance(of.link, Radio) and of.link.loses:
-                senders = [unit for unit in members if of.units is None or unit in of.units]
-                for sender, best in _find_best_receptions(replay, units, of.link.reception, senders, of.where):
-                    best_of[of.where, sender] = max(best, best_of.get((of.where, sender), 0.0))
+        for hop in units.links_of(name):
+            if isinstance(hop.link, Radio) and hop.link.loses:
+                senders = [unit for unit in members if hop.units is None or unit in hop.units]
+                for sender, best in _find_best_receptions(replay, units, hop.link.reception, senders, hop.where):
+                    best_of[hop.where, sender] = max(best, best_of.get((hop.where, sender), 0.0))
     for (where, sender), best in best_of.items():
         if best < _LOST:
             yield f"{where}: no list of {sender} arrives, its reception is {'at most ' * (best > 0)}{best:.1g}"
@@ -370,7 +370,7 @@ def _find_missing_hosts(replay: Replay, experiment: Experiment) -> Iterator[str]
 
 
 def could_meet(replay: Replay) -> Bool:
-    """(U,) whether an object ever has range, azimuth and class of a condition of each modelled unit's PEM.
+    """(U,) whether any object ever has range, azimuth and class of a condition of each modelled unit's PEM.
 
     Visibility is left out: where no condition is met here, no replay meets one.
     """
@@ -440,34 +440,34 @@ def _find_idle_units(replay: Replay, experiment: Experiment, met: Bool) -> Itera
         members = [member for named, member in of_name if named == name]
         absent = [m for m in members if not replay.placed.poses[m].present.any()]
         unmet = [m for m in members if m not in absent and not modelled[m]]
-        for which, what in (
+        for unit_names, reason in (
             (absent, "makes no list, its carrier is never in the log"),
             (unmet, f"no object ever meets a condition of its PEM {unit.pem!r}"),
         ):
-            if which:
-                yield f"unit {name}{_count_carriers(which, members)}: {what}"
+            if unit_names:
+                yield f"unit {name}{_count_carriers(unit_names, members)}: {reason}"
 
 
-def _count_carriers(which: list[str], members: list[str]) -> str:
+def _count_carriers(unit_names: list[str], members: list[str]) -> str:
     """On how many of its carriers a fleet is; empty for a single unit."""
     if len(members) == 1 and ":" not in members[0]:
         return ""
-    return f", on {len(which)} of its {count_noun(len(members), 'carrier')}"
+    return f", on {len(unit_names)} of its {count_noun(len(members), 'carrier')}"
 
 
 def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
     """Why a log gives no rows, or no verdicts."""
     scene, measure, episodes = replay.scene, experiment.measure, replay.episodes
-    asked, outside = measure.objects.within, len(replay.outside_ix)
-    if asked is not None and outside:
+    within, outside = measure.objects.within, len(replay.outside_ix)
+    if within is not None and outside:
         with_onset = count_noun(outside + len(episodes.object_ix), "object")
-        yield f"objects.within: {outside} of {with_onset} with an onset left out, {describe_excluded(asked)}"
+        yield f"objects.within: {outside} of {with_onset} with an onset left out, {describe_excluded(within)}"
     if not len(measured_objects(scene, measure)):
         others = np.arange(len(scene.object_class)) != scene.ego_ix
         logged = sorted({CLASSES[k] for k in scene.object_class[others]}) or ["no other object"]
-        wanted = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
-        beside = " beside the ego" if scene.ego_ix >= 0 else ""
-        yield f"no rows: nothing to measure ({', '.join(wanted)}); the log has {', '.join(logged)}{beside}"
+        names = measure.objects.classes or measure.objects.ids or ("moving objects but the ego",)
+        suffix = " beside the ego" if scene.ego_ix >= 0 else ""
+        yield f"no rows: nothing to measure ({', '.join(names)}); the log has {', '.join(logged)}{suffix}"
     elif (instant_s := measure.onset.instant_s) is not None and instant_s > scene.end_s:
         yield f"no rows: the onset at {instant_s:g} s lies after the log's end, {scene.end_s:g} s"
     elif not len(episodes.object_ix) and outside:
@@ -489,11 +489,11 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
 
 def _find_returns(replay: Replay) -> Iterator[str]:
     """Objects that come back to the condition, of which only the first episode counts."""
-    back = np.flatnonzero(replay.episodes.returns)
-    if not len(back):
+    returning = np.flatnonzero(replay.episodes.returns)
+    if not len(returning):
         return
-    most, number = back[np.argmax(replay.episodes.returns[back])], int(replay.episodes.returns.max())
-    others = f", {count_noun(len(back) - 1, 'other object')} too" if len(back) > 1 else ""
+    most, number = returning[np.argmax(replay.episodes.returns[returning])], int(replay.episodes.returns.max())
+    others = f", {count_noun(len(returning) - 1, 'other object')} too" if len(returning) > 1 else ""
     yield (
         f"object {replay.scene.object_ids[replay.episodes.object_ix[most]]} comes back {count_noun(number, 'time')} "
         f"after more than {AGAIN_AFTER_S:g} s{others}; only the first episode counts (`onset: {{again_after_s: "
@@ -508,35 +508,35 @@ RANGES_M = (30.0, 40.0, 50.0)
 
 
 def list_began(ready: Sequence[Replay], experiment: Experiment) -> list[str]:
-    """Lines of `check`: how many objects of all logs begin how, with `in_range` at each of `RANGES_M`."""
+    """Lines of `check`: how many objects of all logs begin in each way, with `in_range` at each of `RANGES_M`."""
     onset = experiment.measure.onset
-    asked: dict[str, Onset] = {f"within {range_m:g} m": InRange(range_m=range_m) for range_m in RANGES_M}
+    onsets: dict[str, Onset] = {f"within {range_m:g} m": InRange(range_m=range_m) for range_m in RANGES_M}
     if not isinstance(onset, InRange):
-        asked = {onset.kind: onset}
+        onsets = {onset.kind: onset}
     elif onset.range_m not in RANGES_M:
-        asked[f"within {onset.range_m:g} m"] = onset
+        onsets[f"within {onset.range_m:g} m"] = onset
     lines = []
-    for label, one in asked.items():
+    for label, candidate in onsets.items():
         total = np.zeros(len(BEGAN), dtype=np.int64)
         for replay in ready:
-            alone = resolve_for_log(experiment, replay.scene.log)
-            measure = alone.measure.model_copy(update={"onset": one})
-            measured = alone.model_copy(update={"measure": measure})
-            same = one == alone.measure.onset
-            total += (replay.episodes if same else replay.find_episodes_of(measured)).count_began()
-        chosen = " (chosen)" if one == onset and len(asked) > 1 else ""
-        lines.append(f"{label}: {_describe_counted(total.tolist(), experiment.measure.began)}{chosen}")
+            local = resolve_for_log(experiment, replay.scene.log)
+            measure = local.measure.model_copy(update={"onset": candidate})
+            measured = local.model_copy(update={"measure": measure})
+            is_same = candidate == local.measure.onset
+            total += (replay.episodes if is_same else replay.find_episodes_of(measured)).count_began()
+        mark = " (chosen)" if candidate == onset and len(onsets) > 1 else ""
+        lines.append(f"{label}: {_describe_counted(total.tolist(), experiment.measure.began)}{mark}")
     return lines
 
 
 def _describe_counted(numbers: Sequence[int], words: Sequence[str]) -> str:
     """`18 objects count: 14 crossed, 4 appeared; not 1 log_start`."""
     counted = count_counted(numbers, words)
-    told: tuple[list[str], list[str]] = [], []
+    parts: tuple[list[str], list[str]] = [], []
     for word, number in zip(BEGAN, numbers, strict=True):
         if number:
-            told[word not in words].append(f"{number} {word}")
-    of, left = (", ".join(part) for part in told)
+            parts[word not in words].append(f"{number} {word}")
+    of, left = (", ".join(part) for part in parts)
     return f"{count_noun(counted, 'object')} count{'s' * (counted == 1)}{of and f': {of}'}{left and f'; not {left}'}"
 
 
@@ -545,7 +545,7 @@ def _describe_counted(numbers: Sequence[int], words: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What results say of one log in one experiment beside its rows. `times`: as `measure_list_rates` gives them.
+    """The facts of one log in one experiment that results state beside its rows. `times`: as of `measure_list_rates`.
 
     `episodes`: rows of a run and configuration; `began`: how many began in each of the ways `BEGAN`. `same_instants`:
     whether all runs have the same units, and lists at the same instants. `listable`: observation rows, by which the
@@ -603,7 +603,7 @@ def scene_as_json(scene: Scene) -> dict[str, Any]:
 
 
 def scene_from_json(data: dict[str, Any]) -> Scene:
-    """The scene of plain data that `scene_as_json` gave."""
+    """The scene from the plain data of `scene_as_json`."""
     return Scene(
         **data
         | {

@@ -56,7 +56,7 @@ class RunTracks:
             yield chunk.fused
 
     def chunks(self) -> Iterator[RunChunk]:
-        """The fused tracks, and the lists of the units that they are made of."""
+        """Pairs of the fused tracks of a time chunk and the unit lists that they are made of."""
         if len(self.replay.chunks) == 1:
             yield self._all
         else:
@@ -100,38 +100,38 @@ class RunTracks:
 
 
 class RunChunk(NamedTuple):
-    """The fused tracks of a run in one time chunk, by configuration, and what gives the lists of its units."""
+    """The fused tracks of a run in one time chunk, by configuration, and the source of its units' lists."""
 
     fused: dict[str, FusedTracks]
     unit_lists: Callable[[], list[ReadyLists]]
 
 
 def collect_unit_lists(world: WorldChunk, sent: Transmission, arriving: Mapping[str, Tracks]) -> list[ReadyLists]:
-    """What units that are not recorded have ready to send in a time chunk of one run, as fusions get it.
+    """The lists that modelled units have ready to send in a time chunk of one run, in the form that fusions get.
 
     `arriving`: by configuration the lists by when they reach its receiver.
     """
-    chunk, experiment, every = world.chunk, world.experiment, sent.lists
-    ready_s = every.common_arrives_s
+    chunk, experiment, all_lists = world.chunk, world.experiment, sent.lists
+    ready_s = all_lists.common_arrives_s
     ready = np.isfinite(ready_s) & (ready_s >= chunk.from_s) & (ready_s < chunk.until_s)
-    earliest_s = float(every.captured_s[ready].min(initial=np.inf)) - SAME_INSTANT_S
+    earliest_s = float(all_lists.captured_s[ready].min(initial=np.inf)) - SAME_INSTANT_S
     if earliest_s < world.earliest_s:
         world = sent.world(chunk, earliest_s)
     if experiment.draws_claims and not experiment.runs_apart:
         world = replace(world, claiming=True, _listed={}, _sent={})
     entries, _, rows = remove_truth_ids(world)
-    stated = state_captures(world.scene, every, experiment, int(world.group.runs[0]))
+    captures = state_captures(world.scene, all_lists, experiment, int(world.group.runs[0]))
     result = []
-    for name, sends in zip(every.units, world.group.sending, strict=True):
+    for name, sends in zip(all_lists.units, world.group.sending, strict=True):
         if name not in experiment.recorded and sends:
-            frames = np.flatnonzero(ready & (every.frame_unit_ix == every.units.index(name)))
+            frames = np.flatnonzero(ready & (all_lists.frame_unit_ix == all_lists.units.index(name)))
             frames = frames[np.argsort(ready_s[frames], kind="stable")]
             start, places = expand_ranges(entries.start[0], frames)
-            lists = _make_unit_tracks(world, name, frames, start, entries.entries[places], rows[places], stated)
+            lists = _make_unit_tracks(world, name, frames, start, entries.entries[places], rows[places], captures)
             heard = (c for c, of in experiment.configurations.items() if name in experiment.units_of(of))
             arrives_s = {c: arriving[c].common_arrives_s[frames] for c in heard}
-            fields, posed = _find_fields(world, name, every.stamp_ns[frames])
-            true_ns = None if stated is None else every.stamp_ns[frames]
+            fields, posed = _find_fields(world, name, all_lists.stamp_ns[frames])
+            true_ns = None if captures is None else all_lists.stamp_ns[frames]
             has_ids = _states_ids(experiment, name)
             result.append(ReadyLists(name, lists, true_ns, arrives_s, fields, posed, has_ids))
     return result
@@ -160,16 +160,16 @@ def _make_unit_tracks(
     world: WorldChunk, name: str, frames: Int, start: Int, entries: Entries, rows: Int, stated: StatedCaptures | None
 ) -> FusedTracks:
     """The entries (P,) of some lists of a unit as tracks, each one of its own; `rows (P,)`: of what units send."""
-    seen, frame_ix, said = world.sent("sampled"), np.repeat(np.arange(len(frames)), np.diff(start)), entries.copy()
-    captured_s = (seen.captured_s if stated is None else stated.stated_s)[frames]
-    age_s = 0.0 if seen.entry_age_s is None else seen.entry_age_s[0, rows]
-    said["unit_ix"], said["captured_s"] = 0, captured_s[frame_ix] - age_s
-    stamps = world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64), captured_s, seen.common_arrives_s[frames]
-    tracks = make_entry_tracks(name, said, np.arange(len(rows) + 1), seen.row_object_ix[rows], frame_ix, stamps)
-    more: dict[str, Any] = {of: getattr(seen, of) for of in ("yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")}
-    more = {of: None if column is None else column[:, rows] for of, column in more.items()}
-    none = np.zeros(len(rows) + 1, dtype=np.int64)
-    return FusedTracks(replace(tracks, **more), tracks, none[:0], none, said=said)
+    sent, frame_ix, claims = world.sent("sampled"), np.repeat(np.arange(len(frames)), np.diff(start)), entries.copy()
+    captured_s = (sent.captured_s if stated is None else stated.stated_s)[frames]
+    age_s = 0.0 if sent.entry_age_s is None else sent.entry_age_s[0, rows]
+    claims["unit_ix"], claims["captured_s"] = 0, captured_s[frame_ix] - age_s
+    stamps = world.scene.t0_ns + np.rint(captured_s * 1e9).astype(np.int64), captured_s, sent.common_arrives_s[frames]
+    tracks = make_entry_tracks(name, claims, np.arange(len(rows) + 1), sent.row_object_ix[rows], frame_ix, stamps)
+    extra: dict[str, Any] = {of: getattr(sent, of) for of in ("yaw_var_rad2", "size_var_m2", "speed_var_m2ps2")}
+    extra = {of: None if column is None else column[:, rows] for of, column in extra.items()}
+    zeros = np.zeros(len(rows) + 1, dtype=np.int64)
+    return FusedTracks(replace(tracks, **extra), tracks, zeros[:0], zeros, said=claims)
 
 
 def _is_sent_by_link(sent: Tracks, linked: list[str], group: RunGroup) -> Bool:
@@ -194,7 +194,7 @@ STEM = "replay"
 
 @dataclass(frozen=True)
 class ShownRun:
-    """One run that is shown: its number, why it is selected (empty: asked for by number), its files' stem."""
+    """A run that is shown: its number, the reason (empty: asked for by number), and the stem of its files."""
 
     run: int
     why: str
@@ -209,11 +209,11 @@ def select_shown_runs(study: StudyTables, log: str) -> tuple[ShownRun, ...]:
     which never detected counts as; of equal runs the first is taken. Of a log without rows it is the first run.
     """
     experiment = study.experiment
-    asked = experiment.show.asked() if experiment.show is not None else ()
-    rows = _rows_that_count(study, log) if any(isinstance(one, str) for one in asked) else pd.DataFrame()
+    choices = experiment.show.asked() if experiment.show is not None else ()
+    rows = _rows_that_count(study, log) if any(isinstance(one, str) for one in choices) else pd.DataFrame()
     return tuple(
         ShownRun(one, "", stem) if isinstance(one, int) else ShownRun(*_rank_run(rows, study.horizon_s, one), stem)
-        for one, stem in zip(asked, list_stems(experiment), strict=True)
+        for one, stem in zip(choices, list_stems(experiment), strict=True)
     )
 
 
@@ -246,7 +246,7 @@ def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str
 
 
 def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
-    """Those of the names of all logs that are shown."""
+    """The shown logs, out of the names of all."""
     if experiment.show is None or not experiment.show.asked():
         return []
     asked = experiment.show.logs
@@ -257,7 +257,7 @@ def choose_logs(experiment: Experiment, names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class ReplayedRun:
-    """The fused tracks of one run of one log, and the replay and experiment with the units there were in it."""
+    """The fused tracks of one run of one log, with the replay and the experiment of the units in that run."""
 
     replay: Replay
     experiment: Experiment
@@ -287,18 +287,18 @@ class Curve:
 
 
 def share_curves(replay: Replay, observations: Observations, object_ix: int) -> dict[str, Curve]:
-    """The curves of an object by name, without those that have no unit. `observations`: its rows, at least."""
+    """The visible-share curves of an object by name, of units that have a list. `observations`: its rows, at least."""
     scene, experiment, tracks = replay.scene, replay.expanded, observations.tracks
     stamps, newest = _newest_lists(tracks, experiment.max_gap_s)
     carriers = np.array([find_carrier(scene, unit) for unit in experiment.modelled.values()], dtype=np.int64)
-    own = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
+    is_ego = (carriers == scene.ego_ix) & (scene.ego_ix >= 0)
     share = np.full(len(tracks.stamp_ns) + 1, np.nan)  # one more: what −1 points at
     rows = np.flatnonzero(tracks.row_object_ix == object_ix)
     share[tracks.frame_ix[rows]] = observations.view.visible_share[rows]
     # NaN of a unit without a list of the object does not count: the best of the others does.
     return {
         name: Curve(stamps - scene.t0_ns, np.fmax.reduce(share[newest[units]], axis=0))
-        for name, units in ((BY_EGO, own), (BY_ANY, np.ones_like(own)))
+        for name, units in ((BY_EGO, is_ego), (BY_ANY, np.ones_like(is_ego)))
         if units.any()
     }
 

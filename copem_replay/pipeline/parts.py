@@ -74,11 +74,11 @@ class FolderStore:
             raise OutputError(f"{_OPTION}{root}: cannot be written: {error.strerror or error}") from error
 
     def exists(self, name: str) -> bool:
-        """Whether there is such a file."""
+        """Whether the file exists."""
         return (self.root / name).is_file()
 
     def read(self, name: str) -> bytes | None:
-        """The content of a file; None: there is none. Raises OSError."""
+        """The content of a file; None: it does not exist. Raises OSError."""
         try:
             return (self.root / name).read_bytes()
         except FileNotFoundError:
@@ -115,7 +115,7 @@ class BucketStore:
     @cached_property
     def _listed(self) -> set[str]:
         fs, path = self._opened
-        with reraise_in_one_line(self.url, what=_OPTION):
+        with reraise_in_one_line(self.url, prefix=_OPTION):
             fs.invalidate_cache()
             check_answering(self.url, fs, f"{path}/{MARK}")
             paths = await_server(self.where, lambda _: fs.find(path), works=True)
@@ -130,7 +130,7 @@ class BucketStore:
         fs, path = self._opened
         if name not in self._listed:
             return None
-        with reraise_in_one_line(f"{self.url}/{name}", what=_OPTION):
+        with reraise_in_one_line(f"{self.url}/{name}", prefix=_OPTION):
             try:
                 content: bytes = await_server(self.where, lambda _: fs.cat_file(f"{path}/{name}"))
             except FileNotFoundError:  # removed after the listing
@@ -188,7 +188,7 @@ def recipe_key(recipe: str) -> str:
 
 @cache
 def take_fingerprint() -> dict[str, str]:
-    """What numbers depend on beside the recipe: versions of this package and its sources, libraries, Python, libc."""
+    """The versions that numbers depend on beside the recipe: this package and its sources, libraries, Python, libc."""
     package = Path(__file__).parents[1]
     digest = hashlib.blake2b(digest_size=20)
     for path in sorted(package.rglob("*.py")):
@@ -231,15 +231,15 @@ def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], li
         of_part["tags"] = experiment.tags
     if experiment.has_areas:
         of_part["areas_named"] = True  # a column of the rows, of a log without areas, too
-    own = own_components(
+    components = own_components(
         configuration, experiment.visibility, experiment.measure.model_copy(update={"metrics": ()}),
         experiment.braking, *(experiment.pems[pem] for pem in pems),
         *(experiment.units[unit] for unit in units), *(experiment.links[link] for link in links), *experiment.maps,
     )  # fmt: skip
     for key in NOT_OF_A_PART:
-        within, _, last = key.rpartition(".")
-        (data[within] if within else data).pop(last, None)
-    return data | of_part, own
+        section, _, last = key.rpartition(".")
+        (data[section] if section else data).pop(last, None)
+    return data | of_part, components
 
 
 def _list_dependencies(experiment: Experiment, configuration: Configuration) -> list[str]:
@@ -254,19 +254,19 @@ def _list_dependencies(experiment: Experiment, configuration: Configuration) -> 
 
 
 def own_components(*models: BaseModel | None) -> list[Component | MapFile]:
-    """What of models depends on files: the user's own components, recorded latencies, maps."""
+    """The parts of models that come from files: the user's own components, recorded latencies, maps."""
     components = (one for model in models for one in _find_components(model))
     return [one for one in components if is_own(type(one)) or isinstance(one, RecordedLatency | MapFile)]
 
 
-def file_digests(own: Sequence[Component | MapFile], read: TruthTopic | TruthFields) -> dict[str, str]:
+def file_digests(parts: Sequence[Component | MapFile], read: TruthTopic | TruthFields) -> dict[str, str]:
     """SHA-256 of the files that define own components (not of what they import), of recorded latencies, of maps, and of
     definitions of messages.
     """
-    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in own if is_own(type(one))}}
+    files = {kind: Path(inspect.getfile(kind)) for kind in {type(one) for one in parts if is_own(type(one))}}
     contents = {f"{k.__module__}:{k.__qualname__}": f.read_bytes() for k, f in files.items()}
-    contents |= {one.file: repr(one.sorted_s).encode() for one in own if isinstance(one, RecordedLatency)}
-    maps = {one.file: one.sha256 for one in own if isinstance(one, MapFile)}
+    contents |= {one.file: repr(one.sorted_s).encode() for one in parts if isinstance(one, RecordedLatency)}
+    maps = {one.file: one.sha256 for one in parts if isinstance(one, MapFile)}
     definitions = [] if read.definitions is None else sorted(Path(str(read.definitions)).rglob("*.msg"))
     contents |= {str(path): path.read_bytes() for path in definitions}
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()} | maps
@@ -292,7 +292,7 @@ shares fewer parts with a longer one, and more memory is needed; no result chang
 
 
 def cut_parts(runs: int, object_states: int) -> list[tuple[int, int]]:
-    """The blocks of runs, from and up to, that are parts: as many each as the log's size says, the last one cut.
+    """The blocks of runs, (from, until), that are parts: of a size that depends on the log's size; the last one is cut.
 
     That many is a power of two: sums of accuracy are a tree over runs. More runs find the parts of fewer.
     """
@@ -325,7 +325,7 @@ class PartCache:
             return None
 
     def write(self, recipe: str, part: PartTables) -> PartTables:
-        """Keep a part; returns it. Raises OutputError."""
+        """Cache a part; returns it. Raises OutputError."""
         self.store.write(part_name(recipe), _seal(pack_part(part, recipe)))
         self.computed += 1
         return self._reread(recipe, part)
@@ -343,19 +343,19 @@ class PartCache:
         return replace(part, again=again) if isinstance(self.store, FolderStore) else part
 
     def known(self, about: str) -> dict[str, Any] | None:
-        """The facts of a log, kept under `about`, all that they depend on; None: missing or damaged."""
+        """The cached facts of a log under the key `about`; None: missing or damaged."""
         try:
             facts: Any = parse_json(_unseal(self.store.read(_record_name(about)) or b""))
         except (OSError, ValueError):
             return None
         return facts if isinstance(facts, dict) else None
 
-    def keep(self, about: str, said: Mapping[str, Any]) -> None:
-        """Keep facts of a log under `about`. Raises OutputError."""
-        self.store.write(_record_name(about), _seal(canonical_json(said).encode()))
+    def keep(self, key: str, facts: Mapping[str, Any]) -> None:
+        """Cache facts of a log under `key`. Raises OutputError."""
+        self.store.write(_record_name(key), _seal(canonical_json(facts).encode()))
 
     def forget(self, about: str) -> None:
-        """Remove the facts of a log under `about`. Raises OutputError."""
+        """Remove the facts of a log under the key `about`. Raises OutputError."""
         self.store.write(_record_name(about), b"")
 
 

@@ -74,13 +74,13 @@ _AFTER = 0.381966
 def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> tuple[TimeChunk, ...]:
     """A log in time chunks of about as many observation rows each."""
     rows = observation_rows(scene, truth, experiment)
-    fusions = [one.fusion for one in experiment.configurations.values()]
+    fusions = [c.fusion for c in experiment.configurations.values()]
     whole = any(isinstance(one, IdealFusion) and one.memory is not None for one in fusions)
     if (
         rows <= ROWS_AT_ONCE
         or whole
         or experiment.fusing
-        or not all(one.resumable for one in fusions if isinstance(one, ListFusion))
+        or not all(fusion.resumable for fusion in fusions if isinstance(fusion, ListFusion))
     ):
         return (TimeChunk(),)
     _, bounds = truth.by_frame
@@ -94,7 +94,7 @@ def time_chunks(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> 
 
 
 def observation_rows(scene: Scene, truth: Tracks, experiment: ExpandedExperiment) -> float:
-    """About how many observation rows a log has, with those of the truth, which is perceived like a unit."""
+    """The estimated number of observation rows of a log, with those of the truth, which is perceived like a unit."""
     lists = sum(len(list_instants(scene, truth, unit)) for unit in experiment.modelled.values())
     return len(truth.frame_ix) * (1 + lists / max(len(truth.stamp_ns), 1))
 
@@ -121,7 +121,7 @@ class TruthCache:
         return self._keep(self._worlds, time_s, self.between)
 
     def between(self, time_s: Float) -> Tracks:
-        """The truth at instants (K,), ascending, which is not kept."""
+        """The truth at instants (K,), ascending, without caching."""
         return interpolate_at_instants(
             self.truth, self._stamps(time_s), t0_ns=self.scene.t0_ns, max_gap_s=self.experiment.max_gap_s
         )
@@ -130,15 +130,15 @@ class TruthCache:
         """The truth at stated instants (K,), ascending; `captured_s`: the earliest and latest true capture of each."""
         return self._keep(self._worlds, np.stack([time_s, *captured_s]), self._at_stated)
 
-    def _keep(self, kept: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
-        """What is kept of these instants, else what `compute` gives, which replaces the oldest."""
+    def _keep(self, cache: dict[bytes, T], time_s: Float, compute: Callable[[Float], T]) -> T:
+        """The cached value at these instants, else the computed one, which is cached and evicts the oldest."""
         key = time_s.tobytes()
-        found = kept.get(key)
-        if found is None:
-            found = kept[key] = compute(time_s)
-            for oldest in list(kept)[:-KEPT]:
-                kept.pop(oldest, None)
-        return found
+        value = cache.get(key)
+        if value is None:
+            value = cache[key] = compute(time_s)
+            for oldest in list(cache)[:-KEPT]:
+                cache.pop(oldest, None)
+        return value
 
     def _at_stated(self, times_s: Float) -> Tracks:
         stamps, earliest, latest = self._stamps(times_s)
@@ -151,7 +151,7 @@ class TruthCache:
         return self.scene.t0_ns + np.rint(time_s * 1e9).astype(np.int64)
 
     def reference(self, time_s: Float) -> Reference:
-        """From where distances are measured, at instants (K,)."""
+        """The place that distances are measured from, at instants (K,)."""
         return self._keep(self._references, time_s, self._locate_reference)
 
     def _locate_reference(self, time_s: Float) -> Reference:
@@ -169,7 +169,7 @@ class TruthCache:
         return may_be_measured
 
     def since_s(self, episodes: Episodes) -> Float:
-        """(M,) when the object of each episode first is in the log."""
+        """(M,) the first instant of each episode's object in the log."""
         since: Float = self._begins_s[episodes.object_ix]
         return since
 
@@ -183,7 +183,7 @@ class TruthCache:
 
 @dataclass(frozen=True)
 class Replay:
-    """One log made ready for its runs: nothing in it depends on the run or on a configuration's fusion."""
+    """One prepared log: nothing in it depends on the run or on a configuration's fusion."""
 
     scene: Scene
     expanded: ExpandedExperiment  # the experiment's units over this log
@@ -202,7 +202,7 @@ class Replay:
     _shares: KeptShares = field(init=False, default_factory=KeptShares)
 
     def expand(self, experiment: Experiment) -> ExpandedExperiment:
-        """An experiment with the units of this log. Raises ValueError where it has others."""
+        """The experiment expanded to the units of this log. Raises ValueError where it has others."""
         return expand_alike(experiment, self.expanded)
 
     @cached_property
@@ -212,7 +212,7 @@ class Replay:
 
     @cached_property
     def truth_demand(self) -> TruthDemand | None:
-        """When the truth gives the driver a reason to brake; None: it is not asked whether lists do without one."""
+        """When the truth gives the driver a reason to brake; None: needless braking is not measured."""
         braking, needless = self.expanded.braking, self.expanded.needless
         if braking is None or needless is None or self.scene.ego_ix < 0:
             return None
@@ -221,7 +221,7 @@ class Replay:
 
     @cached_property
     def passing_s(self) -> dict[int, Float]:
-        """By episode in conflict the intervals (K, 2) in which the ego may begin to brake and passes."""
+        """Intervals (K, 2) by episode in conflict: if the ego begins to brake in one of them, it passes."""
         braking = self.expanded.braking
         if braking is None:
             return {}
@@ -231,12 +231,12 @@ class Replay:
 
     @cached_property
     def measured_truth(self) -> Tracks:
-        """The truth of objects that have an episode, without states; its lists are those of all."""
+        """The truth of objects with an episode, without states; its lists are those of the whole truth."""
         keep = np.repeat(np.isin(self.truth.object_ix, self.episodes.object_ix), np.diff(self.truth.start))
         return self.truth if keep.all() else self.truth.take_rows(np.flatnonzero(keep), states=False)
 
     def with_units(self, expanded: ExpandedExperiment) -> Replay:
-        """The log for an experiment that lacks units which fuse."""
+        """The log for an experiment without the units that fuse."""
         return self._keep_observed(replace(self, expanded=expanded))
 
     def with_recorded(self, recorded: RecordedUnits) -> Replay:
@@ -246,8 +246,8 @@ class Replay:
 
     def _keep_observed(self, other: Replay) -> Replay:
         """Another log, with what modelled units observe of this one: it is computed once."""
-        kept = ("_whole", "no_rows", "measured", "truth_cache", "_overview", "measured_truth")
-        vars(other).update({name: getattr(self, name) for name in kept})
+        shared = ("_whole", "no_rows", "measured", "truth_cache", "_overview", "measured_truth")
+        vars(other).update({name: getattr(self, name) for name in shared})
         return other
 
     def find_episodes_of(self, experiment: Experiment) -> Episodes:
@@ -261,7 +261,7 @@ class Replay:
 
     @property
     def sight_spans(self) -> SightSpans:
-        """What each unit that is known to look has of each episode, from list to list."""
+        """The spans, list by list, in which an object is in one state to a unit: of units with a PEM or `views`."""
         return self._overview[0]
 
     @property
@@ -276,14 +276,14 @@ class Replay:
         viewing = give_views(self.expanded, alone=True)
         for chunk in self.chunks:
             observations = self.observe(chunk)
-            looks = [(observations, self.expanded)]
+            observed = [(observations, self.expanded)]
             if viewing is not self.expanded:
-                looks.append((self._observe_with(viewing, chunk), viewing))
-            for seen, by in looks:
-                numbers = self.episodes.number_rows(seen.tracks)
-                found = find_sight_changes(seen, by, self.scene.tags, numbers)
-                unit_ix = np.array([units.index(name) for name in seen.tracks.units], dtype=np.int64)[found.unit_ix]
-                changes.append(found._replace(unit_ix=unit_ix))
+                observed.append((self._observe_with(viewing, chunk), viewing))
+            for seen, experiment in observed:
+                episode_ix = self.episodes.number_rows(seen.tracks)
+                changed = find_sight_changes(seen, experiment, self.scene.tags, episode_ix)
+                unit_ix = np.array([units.index(name) for name in seen.tracks.units], dtype=np.int64)
+                changes.append(changed._replace(unit_ix=unit_ix[changed.unit_ix]))
             met.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
         return join_sight_changes(changes, self.episodes.onset_s), np.any(met, axis=0), rows
@@ -295,12 +295,12 @@ class Replay:
 
     @cached_property
     def held_frames(self) -> HeldFrames:
-        """The frames at which it is measured what receivers hold."""
+        """The frames at which the lists that receivers hold are measured."""
         around = self.truth_cache
         return make_held_frames(self.truth.captured_s, self.episodes.firsts, around.between, around.reference)
 
     def truth_cache_of(self, chunk: TimeChunk) -> TruthCache:
-        """The truth that configurations share: of a whole log it is kept, of a time chunk it is made anew."""
+        """The truth that configurations share: cached for a whole log, made anew for a time chunk."""
         whole = chunk == TimeChunk()
         return self.truth_cache if whole else TruthCache(self.scene, self.truth, self.expanded)
 
@@ -315,25 +315,25 @@ class Replay:
 
     @cached_property
     def measured(self) -> Observations:
-        """The observation rows of objects that have an episode, without visible shares that nothing draws from."""
+        """The observation rows of objects with an episode; visible shares only where a draw depends on them."""
         return self._observe_objects(self.episodes.object_ix)
 
     def _observe_objects(self, object_ix: Int) -> Observations:
         return join_observations([self.observe(chunk).of_objects(object_ix) for chunk in self.chunks])
 
     def rows_of(self, object_ix: Int) -> Observations:
-        """The observation rows of some objects, with all visible shares, which are computed anew."""
+        """The observation rows of some objects, with all visible shares, computed anew."""
         return join_observations([self._observe(chunk, chunk.from_s, only_ix=object_ix) for chunk in self.chunks])
 
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
-        """The observation rows captured in a time chunk, or from `from_s` on. Those of a whole log are kept.
+        """The observation rows captured in a time chunk, or from `from_s` on; cached for a whole log.
 
         Visible shares are there where a couple may apply, and of the ego.
         """
         if chunk == TimeChunk():
             return self._whole
         begin_s = chunk.from_s if from_s is None else from_s
-        return self._observe(chunk, begin_s, kept=self._shares, cut_s=chunk.from_s, as_read=True)
+        return self._observe(chunk, begin_s, cache=self._shares, cut_s=chunk.from_s, as_read=True)
 
     def _observe(self, chunk: TimeChunk, from_s: float, **how: Any) -> Observations:
         """The observation rows of a time chunk; lists, which are those of the whole log, are in memory once."""
@@ -348,7 +348,7 @@ class Replay:
         )
 
     def observe_listable(self, chunk: TimeChunk, from_s: float, *, complete: bool) -> Observations:
-        """The rows that can be listed, captured from `from_s` on; of all objects, or only of those with an episode."""
+        """The rows that can be listed, captured from `from_s` on, of all objects or of those with an episode."""
         if complete:
             return self.observe(chunk, from_s).listable
         if len(self.chunks) == 1:
@@ -357,20 +357,20 @@ class Replay:
 
     @property
     def rows_kept(self) -> int:
-        """How many observation rows are kept: all of a log in one time chunk, of others those of measured objects."""
+        """The number of cached observation rows: all of a log in one time chunk, else those of measured objects."""
         return self._overview[2] if len(self.chunks) > 1 else len(self._whole.tracks.frame_ix)
 
-    def add_recorded(self, seen: Tracks, recorded: RecordedUnits | None) -> Tracks:
-        """What modelled units list, and then lists of recorded ones; units are in the experiment's order."""
+    def add_recorded(self, tracks: Tracks, recorded: RecordedUnits | None) -> Tracks:
+        """The lists of modelled units, then those of recorded ones; units in the experiment's order."""
         if recorded is None:
-            return seen
+            return tracks
         lists = recorded.tracks
-        lists = replace(lists, valid=np.broadcast_to(lists.valid, (len(seen.valid), len(lists.frame_ix))))
-        both = join_tracks((*seen.units, *lists.units), [seen, lists])
+        lists = replace(lists, valid=np.broadcast_to(lists.valid, (len(tracks.valid), len(lists.frame_ix))))
+        joined = join_tracks((*tracks.units, *lists.units), [tracks, lists])
         # It decides between lists that arrive together.
         names = tuple(self.expanded.units)
-        place = np.array([names.index(name) for name in both.units])
-        return replace(both, units=names, unit_ix=place[both.unit_ix], frame_unit_ix=place[both.frame_unit_ix])
+        place = np.array([names.index(name) for name in joined.units])
+        return replace(joined, units=names, unit_ix=place[joined.unit_ix], frame_unit_ix=place[joined.frame_unit_ix])
 
     @cached_property
     def paths(self) -> RadioPath:
@@ -407,7 +407,7 @@ class Replay:
 
     @cached_property
     def senders(self) -> np.ndarray:
-        """(F,) the unit of each list of all units, by name; the modelled ones' first."""
+        """(F,) the name of the unit of each list of all units; modelled ones first."""
         lists = self.recorded_lists
         return np.array(lists.units, dtype=str)[lists.frame_unit_ix]
 
@@ -420,18 +420,18 @@ def _find_kept_episodes(
 
 
 def prepare_log(recording: Recording, experiment: Experiment, *, onsets_of: Experiment | None = None) -> Replay:
-    """Everything about a log that all runs and configurations share. Raises ExperimentError where an ego is missing.
+    """The prepared log: all that its runs and configurations share. Raises ExperimentError where an ego is missing.
 
     `onsets_of`: the experiment that onsets are of, where `experiment` has the units of one run (`resolve_for_run`).
     """
     scene = recording.scene
     if scene.ego_ix < 0:
         driven = experiment.ego != NO_EGO  # a log that says it has none lacks verdicts, and no other log does
-        for key, asked in (
+        for key, setting in (
             ("braking", driven and experiment.braking),
             ("measure.conflict", experiment.measure.conflict),
         ):
-            if asked:
+            if setting:
                 raise ExperimentError(f"{scene.log}: {key}: no ego in this study to brake or collide")
     expanded = expand_experiment(experiment, scene)
     truth = interpolate_at_instants(

@@ -136,7 +136,7 @@ def _fill_words(
 
 @dataclass(frozen=True)
 class FusedOnce:
-    """What ideal fusion made of lists of the same captures, which configurations with other latencies share."""
+    """The ideal fusion of lists of the same captures, shared by configurations that differ in latency."""
 
     sent: Tracks
     captures: bytes
@@ -148,7 +148,7 @@ class FusedOnce:
         return convert_to_lists(self.fused_tracks, self.fused_tracks.scene)
 
     def lists_arriving(self, received: Tracks) -> ListsWithIds | None:
-        """These as lists, for lists received at other times; None: an entry's first unit may differ.
+        """The fused lists, for inputs that arrive at other times; None: the first unit of an entry may differ.
 
         Which list of two arrived first stays the same where all are later by one latency.
         """
@@ -164,17 +164,17 @@ class FusedOnce:
 
 
 def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> FusedTracks:
-    """The lists of one run as tracks: one of each matched object, one of each identity else, one of each entry else."""
+    """The lists of one run as tracks, one per matched object, else per identity of the fusion, else per entry."""
     lists, received, issue_s, newest = output.lists, output.received, output.instants.issue_s, output.instants.newest
     first, last = int(lists.start[run, 0]), int(lists.start[run, -1])
     entries = lists.entries[first:last]
     frame = np.repeat(np.arange(len(issue_s)), np.diff(lists.start[run]))
     object_ix = np.where(matches.role[first:last] == MATCH, matches.object_ix[first:last], -1)
-    alone = (object_ix < 0) & (entries["track_id"] < 0)
-    identity = np.where(object_ix >= 0, 0, np.where(alone, np.arange(len(entries)), entries["track_id"]))
-    order = np.lexsort((frame, identity, alone, object_ix))
+    untracked = (object_ix < 0) & (entries["track_id"] < 0)
+    identity = np.where(object_ix >= 0, 0, np.where(untracked, np.arange(len(entries)), entries["track_id"]))
+    order = np.lexsort((frame, identity, untracked, object_ix))
     new = np.ones(len(order), dtype=bool)
-    for key in (object_ix, alone, identity):
+    for key in (object_ix, untracked, identity):
         new[1:] &= key[order][1:] == key[order][:-1]
     new[1:] = ~new[1:]
     start = np.append(np.flatnonzero(new), len(order))
@@ -182,10 +182,10 @@ def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> Fus
     captured = np.where(newest >= 0, received.captured_s[newest], -np.inf).max(axis=1, initial=-np.inf)
     captures = stamps, captured, issue_s
     fused = make_entry_tracks("fused", entries[order], start, object_ix[order][start[:-1]], frame[order], captures)
-    none = np.zeros(len(order) + 1, dtype=np.int64)
+    zeros = np.zeros(len(order) + 1, dtype=np.int64)
     stated_s = None if output.stated is None else output.told.entries["captured_s"][first:last][order]
     second_of = np.where(matches.role[first:last] == DUPLICATE, matches.object_ix[first:last], -1)[order]
-    return FusedTracks(fused, received, none[:0], none, None, entries[order], stated_s=stated_s, second_of=second_of)
+    return FusedTracks(fused, received, zeros[:0], zeros, None, entries[order], stated_s=stated_s, second_of=second_of)
 
 
 def make_entry_tracks(
@@ -206,7 +206,7 @@ def make_entry_tracks(
 
 @dataclass(frozen=True)
 class StatedCaptures:
-    """Captures of the lists (F,) of one run, as units state them and as they are; seconds since the log's start.
+    """Stated and true captures of the lists (F,) of one run; seconds since the log's start.
 
     `older (3, E)`: the same three of entries that are older than their lists.
     """
@@ -218,12 +218,12 @@ class StatedCaptures:
 
     @cached_property
     def told(self) -> Float:
-        """(3, F + E) what is stated, what is true, and arrivals, of all captures that entries may tell of."""
+        """(3, F + E) stated captures, true captures and arrivals, of all captures that entries may name."""
         return np.concatenate([[self.stated_s, self.captured_s, self.arrives_s], self.older], axis=1)
 
     @property
     def ahead_s(self) -> float:
-        """How far a stated capture is ahead of the true one, at most; 0 where none is."""
+        """The largest lead of a stated capture over the true one; 0 where none is ahead."""
         return float((self.stated_s - self.captured_s).max(initial=0.0))
 
     def captured_between_s(self, stated_s: Float) -> tuple[Float, Float]:
@@ -241,7 +241,7 @@ class StatedCaptures:
         return replace(lists, entries=entries)
 
     def true_lists(self, fused: ObjectLists, issue_s: Float) -> ObjectLists:
-        """Fused lists, one run of K available at `issue_s`, whose entries go back to true captures."""
+        """Fused lists, one run of K available at `issue_s`, with true captures in their entries."""
         entries = fused.entries.copy()
         entries["captured_s"] = self._true_s(entries["captured_s"], np.repeat(issue_s, np.diff(fused.start[0])))
         return replace(fused, entries=entries)
@@ -262,7 +262,7 @@ class StatedCaptures:
 
 
 def state_captures(scene: Scene, received: Tracks, experiment: ExpandedExperiment, run: int) -> StatedCaptures | None:
-    """What a receiver is told of the captures of the lists it hears, none after its arrival; None: the truth."""
+    """The captures that units state to a receiver, none after the list's arrival; None: they state the truth."""
     error_s = clock_errors_s(scene, received.units, experiment, received.captured_s, received.frame_unit_ix, run)
     if error_s is None:
         return None
@@ -302,17 +302,17 @@ class ReceiverOutput:
 
     @cached_property
     def lists(self) -> ObjectLists:
-        """The fused lists without truth ids; their entries go back to true captures."""
+        """The fused lists without truth ids, with true captures in their entries."""
         return self.told if self.stated is None else self.stated.true_lists(self.told, self.instants.issue_s)
 
     @property
     def told(self) -> ObjectLists:
-        """The fused lists without truth ids; their entries have the captures that the fusion was told of."""
+        """The fused lists without truth ids, with the captures that units stated to the fusion."""
         return self._lists_with_ids.lists
 
     @cached_property
     def origins(self) -> Origins:
-        """What the entries of the fused lists go back to."""
+        """The lists that the entries of the fused lists go back to."""
         holdings = self.origin.find_holdings(self.instants.issue_s)
         return Origins(self.lists.entries, self._lists_with_ids.object_ix, holdings)
 
@@ -338,7 +338,7 @@ class ReceiverOutput:
 
 
 def states_needed(configuration: Configuration) -> States | None:
-    """What has to be drawn of units' rows for the fused states of a configuration; None, of the truth: nothing."""
+    """The states that must be drawn for a configuration's fused states; None, for the truth: none."""
     if configuration.units == TRUTH:
         return None
     fusion = configuration.fusion
@@ -346,7 +346,7 @@ def states_needed(configuration: Configuration) -> States | None:
 
 
 class Receivers:
-    """The receivers of the configurations `names`, None: of all, and what they remember.
+    """The receivers of the configurations `names`, None: of all, with their memory.
 
     Time chunks of one log are received one after the other, in order of time.
     """
@@ -381,7 +381,7 @@ class Receivers:
         return self._schedules[name].issue_s
 
     def fuse(self, world: WorldChunk, name: str) -> ReceiverOutput:
-        """What the receiver of a configuration issues in a time chunk, of the lists that reach it.
+        """The output of a configuration's receiver in a time chunk, from the lists that reach it.
 
         Raises InputError where a fusion of the user's own fails.
         """
@@ -443,21 +443,21 @@ class Receivers:
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
         """Fusion of lists without truth ids, told of the captures that units state."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        lists, same, _ = remove_truth_ids(world)
-        stated, captured_s = self._state_captures(received), None
-        if stated is not None:
-            lists, captured_s = stated.as_told(lists), stated.stated_s
+        lists, object_of, _ = remove_truth_ids(world)
+        captures, captured_s = self._state_captures(received), None
+        if captures is not None:
+            lists, captured_s = captures.as_told(lists), captures.stated_s
         inputs = make_inputs(received, lists, max_age_s=max_age_s, instants=instants, captured_s=captured_s)
         if (partial := output.origin.partial).any():
-            sent = SentEntries(lists.start[0], same)
-            kept = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
-            inputs = add_kept_entries(inputs, kept, partial, max_age_s)
+            sent = SentEntries(lists.start[0], object_of)
+            cached = keep_entries(received, sent, partial, self._schedules[name], instants, max_age_s=max_age_s)
+            inputs = add_kept_entries(inputs, cached, partial, max_age_s)
         where = f"configurations.{name}.fusion"
         if fusion.resumable:
             fused, self._memory[name] = ask_resumed_fusion(fusion, inputs, self._memory.get(name), where)
         else:  # a log with such a fusion is one time chunk
             fused = ask_fusion(fusion, inputs, where)
-        return self._reach_origin(world, replace(output, fused=fused, tells_of=fusion.tells_of, stated=stated))
+        return self._reach_origin(world, replace(output, fused=fused, tells_of=fusion.tells_of, stated=captures))
 
     def _reach_origin(self, world: WorldChunk, output: ReceiverOutput) -> ReceiverOutput:
         """The output, its origin reaching back to the lists of its oldest entries: a track may coast for long."""
@@ -495,27 +495,27 @@ class Receivers:
     def _fuse_once(self, name: str, output: ReceiverOutput) -> FusedOnce:
         """What ideal fusion makes of lists. Later lists of the same captures, as in a sweep, are fused once."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        partial, kept = output.origin.partial, None
+        partial, cached = output.origin.partial, None
         if partial.any():
-            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
-        beside = find_lists_beside_newest(received, instants, kept)
-        parts = (instants.newest, *beside, *(() if kept is None else [kept.entry]))
+            cached = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
+        beside = find_lists_beside_newest(received, instants, cached)
+        parts = (instants.newest, *beside, *(() if cached is None else [cached.entry]))
         captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
         if last is None or last.sent is not output.sent or last.captures != captures:
-            own = output.scene.ego_ix
-            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=own, instants=instants, kept=kept)
+            ego = output.scene.ego_ix
+            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=ego, instants=instants, cached=cached)
             self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
         return last
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:
-    """(U,) which of the units that are received leave objects out of their messages."""
+    """Mask (U,) of the received units that send partial lists: they leave objects out of their messages."""
     partial = set(experiment.partial)
     return np.array([unit in partial for unit in received.units], dtype=bool)
 
 
 class Reach:
-    """The earliest captures that the receivers need in a time chunk: of lists that arrive, are kept, or looked back to.
+    """The earliest captures that receivers need in a time chunk: of lists that arrive, are cached, or looked back to.
 
     `received`: by configuration the lists that reach its receiver, whatever is in them. `stated`: the captures that
     their units state, None where these are true.
@@ -547,8 +547,8 @@ class Reach:
             if isinstance(fusion, ListFusion) and fusion.looks_back_s > 0:
                 arrives_s, captured_s = lists.common_arrives_s[schedule.arrived], lists.captured_s[schedule.arrived]
                 ahead_s = 0.0
-                if stated is not None and (told := stated[name]) is not None:  # it looks back in stated captures
-                    captured_s, ahead_s = told.stated_s[schedule.arrived], told.ahead_s
+                if stated is not None and (claim := stated[name]) is not None:  # it looks back in stated captures
+                    captured_s, ahead_s = claim.stated_s[schedule.arrived], claim.ahead_s
                 newest_s = np.maximum.accumulate(captured_s)
                 self._again.append((arrives_s, newest_s - ahead_s - fusion.looks_back_s - AROUND_S))
 
@@ -566,18 +566,18 @@ class Reach:
 
 
 def remove_truth_ids(world: WorldChunk) -> tuple[ObjectLists, Int, Int]:
-    """The units' lists as a real fusion sees them: without truth ids, the entries of each in a random order.
+    """The units' lists as a real fusion gets them: without truth ids, the entries of each list in a random order.
 
     Second, (N,): entries with one number are one object to their unit; empty where no unit sends partial messages.
     Third, (N,): the row of each entry.
     """
-    experiment, seen = world.experiment, world.sent("sampled")
+    experiment, tracks = world.experiment, world.sent("sampled")
     rng, ego = CounterRng(experiment.seed, world.scene.log), world.scene.ego_ix
-    words, (claims, same) = world.words, world.claims
-    random_key = RandomKey(seen.units, seen.row_unit_ix, words, seen.stamp_ns[seen.frame_ix])
+    words, (claims, object_of) = world.words, world.claims
+    random_key = RandomKey(tracks.units, tracks.row_unit_ix, words, tracks.stamp_ns[tracks.frame_ix])
     drawn = rng.uniform("order in the list", random_key, world.group.runs)
-    lists, picked = make_entry_lists(seen, claims, drawn, without_object_ix=ego)
+    lists, entry_rows = make_entry_lists(tracks, claims, drawn, without_object_ix=ego)
     if not experiment.partial:
-        return lists, np.empty(0, dtype=np.int64), picked
-    pairs = np.stack([seen.row_unit_ix[picked].astype(np.uint64), same[picked]])
-    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), picked
+        return lists, np.empty(0, dtype=np.int64), entry_rows
+    pairs = np.stack([tracks.row_unit_ix[entry_rows].astype(np.uint64), object_of[entry_rows]])
+    return lists, np.unique(pairs, axis=1, return_inverse=True)[1].ravel(), entry_rows

@@ -57,7 +57,7 @@ WORTH_A_BLOCK = 2_000_000
 
 @dataclass(frozen=True)
 class BlockOutcome:
-    """What a block of runs (S,) gives: columns of `detections.parquet`, and the scores of the lists by configuration.
+    """The results of a block of runs (S,): columns of `detections.parquet`, and scores of the lists by configuration.
 
     `assessed (M,)`: of which episodes accuracy is measured, the first of each object. `worked_s`: seconds it took;
     `accuracy_s`: those that `measure: {accuracy: false}` would save.
@@ -78,7 +78,7 @@ class BlockOutcome:
 
 
 def cut_blocks(replay: Replay, experiment: Experiment, jobs: int, runs: tuple[int, int] | None = None) -> list[Int]:
-    """All runs, or those of a range, cut into blocks that are small enough for memory and enough for the workers."""
+    """The runs, or a range of them, cut into blocks: small enough for memory, and enough of them for the workers."""
     begin, end = runs or (0, experiment.runs)
     units = replay.expand(experiment)
     rows, room = ROWS_A_CHUNK, CHUNK_BYTES
@@ -126,7 +126,7 @@ def replay_block(replay: Replay, experiment: Experiment, runs: Int) -> pd.DataFr
 
 
 def replay_outcomes(replay: Replay, experiment: Experiment, runs: Int) -> list[BlockOutcome]:
-    """What one block of runs (S,) gives; in several parts where not all runs have the same lists."""
+    """The outcomes of one block of runs (S,); several parts where not all runs have the same lists."""
     began_s, units, measure = time.perf_counter(), replay.expand(experiment), experiment.measure
     # Which lists there are decides which hits are consecutive.
     by_entry = measure.confirm.of == 1 and measure.conflict is None and not _needs_lists(units)
@@ -162,7 +162,7 @@ class GroupOutcome(NamedTuple):
 
 
 def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOutcome:
-    """What every configuration knows of every object, in the runs (S,) of a group, which have the same lists."""
+    """The events and scores of every configuration in the runs (S,) of a group, which have the same lists."""
     units, measure = log.expand(experiment), experiment.measure
     # For detection by truth id alone is drawn which rows are listed; else states as well, for matches of all rows.
     matched = _needs_lists(units)
@@ -174,13 +174,13 @@ def replay_runs(log: Replay, experiment: Experiment, group: RunGroup) -> GroupOu
     judges = {name: Judge(log, units, name, receivers.issue_s(name), matches=matched) for name in fused}
     began_s = time.perf_counter()
     for world in receivers.worlds():
-        seen = world.sightings(lists.states)  # perceive
-        sightings.append(seen.in_lists_of(sightings[0] if sightings else seen))
-        around = log.truth_cache_of(world.chunk)
+        observed = world.sightings(lists.states)  # perceive
+        sightings.append(observed.in_lists_of(sightings[0] if sightings else observed))
+        cache = log.truth_cache_of(world.chunk)
         for name, judge in judges.items():
             output = receivers.fuse(world, name)  # transmit, fuse
-            matches = judge.match(around, output)
-            judge.measure(around, output, matches)
+            matches = judge.match(cache, output)
+            judge.measure(cache, output, matches)
     took_s = time.perf_counter() - began_s
 
     listed = sightings[0] if len(sightings) == 1 else splice_rows(sightings, states=False)[0]
@@ -204,7 +204,7 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     log, units, measure = lists.log, lists.experiment, lists.experiment.measure
     configuration = units.configurations[name]
     names, of_truth = units.units_of(configuration), configuration.units == TRUTH
-    listed, made = (log.measured_truth, lists.truth) if of_truth else (listed, lists.lists)
+    listed, ready = (log.measured_truth, lists.truth) if of_truth else (listed, lists.lists)
     received = lists.receive(listed if of_truth else lists.send(listed), name)
     detections = known or detect_by_truth_id(
         received, log.episodes, confirm=measure.confirm, count_earlier=measure.count_earlier,
@@ -216,7 +216,7 @@ def find_events(lists: Transmission, name: str, listed: Tracks, known: FirstDete
     if units.has_way(name):
         informing = find_informing_list(received, detections)
         arriving = lists.arriving(name).common_arrives_s
-        way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (made.common_arrives_s, arriving)))
+        way = Way(listed_s, *(pick_list_times(informing, times_s) for times_s in (ready.common_arrives_s, arriving)))
     until_s = np.fmin(np.fmin(listed_s, detections.captured_s), log.episodes.ended_s)
     sensing = None if of_truth else units.list_sensing(names)
     sight = measure_sight(log.sight_spans, log.sighted, sensing, lists.group.listing, until_s)

@@ -84,7 +84,7 @@ class _Computing(NamedTuple):
 
 
 class Gatherer:
-    """Computes parts, or finds them. `advance`: called with the number of runs of a log that are done."""
+    """Computes parts or reads them from the cache. `advance`: called with the number of runs of a log that are done."""
 
     def __init__(
         self, jobs: int, cost: RunCost, cache: PartCache | None, advance: Callable[[int], None] = lambda _: None
@@ -93,7 +93,7 @@ class Gatherer:
 
     def each(self, logs: Sequence[StudyLog], experiment: Experiment) -> Iterator[PartTables]:
         """The parts of each log, by block of runs, then by configuration. The next log is read when workers are nearly
-        idle; no more than the parts that are computed are in memory.
+        idle; only parts that are being computed are in memory.
         """
         began_s, waiting = time.perf_counter(), deque[_Computing]()
         pool, reading = ThreadPoolExecutor(self._jobs), ThreadPoolExecutor(_AT_ONCE)
@@ -113,42 +113,42 @@ class Gatherer:
         self, logs: Sequence[StudyLog], experiment: Experiment, pool: Executor, reading: Executor
     ) -> Iterator[_Computing]:
         for log in logs:
-            alone = resolve_for_log(experiment, log.name)
+            local = resolve_for_log(experiment, log.name)
             log.facts(experiment)  # while the log is in memory
             if _is_long(log):  # what reading it took
                 return_memory()
-            blocks = cut_parts(alone.runs, log.object_states)
+            blocks = cut_parts(local.runs, log.object_states)
             for runs in blocks:
-                kept = self._read_parts(log, alone, runs, reading)
-                names, missing, outcomes = [name for name in kept if kept[name] is None], alone, []
-                if len(names) < len(kept):
-                    missing = alone.model_copy(update={"configurations": {n: alone.configurations[n] for n in names}})
+                have = self._read_parts(log, local, runs, reading)
+                names, missing, outcomes = [name for name in have if have[name] is None], local, []
+                if len(names) < len(have):
+                    missing = local.model_copy(update={"configurations": {n: local.configurations[n] for n in names}})
                 if names:
                     replay, workers = log.replay(), -(-self._jobs // len(blocks))
                     outcomes = [
                         pool.submit(call_in_room, replay_outcomes, replay, missing, some)
                         for some in cut_blocks(replay, missing, workers, runs)
                     ]
-                yield _Computing(log, runs, runs == blocks[-1], kept, missing, outcomes)
+                yield _Computing(log, runs, runs == blocks[-1], have, missing, outcomes)
 
     def _read_parts(
-        self, log: StudyLog, alone: Experiment, runs: tuple[int, int], reading: Executor
+        self, log: StudyLog, local: Experiment, runs: tuple[int, int], reading: Executor
     ) -> dict[str, PartTables | None]:
         """The parts of a block that are kept, by configuration; None: missing."""
-        cache, names = self._cache, list(alone.configurations)
+        cache, names = self._cache, list(local.configurations)
         if cache is None:
             return dict.fromkeys(names)
 
         def read(name: str) -> PartTables | None:
-            return cache.read(write_recipe(alone, name, log.identity, runs), log.name, name)
+            return cache.read(write_recipe(local, name, log.identity, runs), log.name, name)
 
-        kept = dict(zip(names, (reading.map if is_url(cache.address) else map)(read, names), strict=True))
-        cache.found += sum(part is not None for part in kept.values())
-        return kept
+        have = dict(zip(names, (reading.map if is_url(cache.address) else map)(read, names), strict=True))
+        cache.found += sum(part is not None for part in have.values())
+        return have
 
     def _finish_block(self, block: _Computing) -> Iterable[PartTables]:
         """Wait for the missing parts of a block, keep them, and return all its parts."""
-        log, kept, outcomes = block.log, block.kept, list[BlockOutcome]()
+        log, known_parts, outcomes = block.log, block.kept, list[BlockOutcome]()
         for future in block.outcomes:
             outcomes += (done := future.result())
             self._advance(sum(len(outcome.runs) for outcome in done))
@@ -156,7 +156,7 @@ class Gatherer:
             log.drop()
         if not outcomes:
             self._advance(block.runs[1] - block.runs[0])
-            return [part for part in kept.values() if part is not None]
+            return [part for part in known_parts.values() if part is not None]
         self._cost.add(0.0, outcomes)
         parts = build_parts(log.name, outcomes, block.missing)
         if _is_long(log):
@@ -166,20 +166,20 @@ class Gatherer:
             if self._cache is not None:
                 recipe = write_recipe(block.missing, part.configuration, log.identity, block.runs)
                 part = self._cache.write(recipe, part)
-            kept[part.configuration] = part
-        return [part for part in kept.values() if part is not None]
+            known_parts[part.configuration] = part
+        return [part for part in known_parts.values() if part is not None]
 
     def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
         """The rows of `exact.parquet` of a log."""
-        alone, cache, rows = resolve_for_log(experiment, log.name), self._cache, list[pa.Table]()
-        for name, configuration in alone.configurations.items():
+        local, cache, rows = resolve_for_log(experiment, log.name), self._cache, list[pa.Table]()
+        for name, configuration in local.configurations.items():
             recipe, part = "", None
             if cache is not None:
-                part = cache.read(recipe := write_recipe(alone, name, log.identity, None), log.name, name)
+                part = cache.read(recipe := write_recipe(local, name, log.identity, None), log.name, name)
                 cache.found += part is not None
             if part is None:
-                only = alone.model_copy(update={"configurations": {name: configuration}})
-                part = PartTables(log.name, name, tabulate_rows(exact_table(log.replay(), only)))
+                single = local.model_copy(update={"configurations": {name: configuration}})
+                part = PartTables(log.name, name, tabulate_rows(exact_table(log.replay(), single)))
                 if cache is not None:
                     cache.write(recipe, part)
             rows.append(part.rows)
@@ -236,12 +236,12 @@ class StudyTables:
 
     @property
     def recordings(self) -> tuple[KnownLog, ...]:
-        """The recording of each log, its content being in memory or not."""
+        """The recording of each log, with or without its content in memory."""
         return tuple(log.recording for log in self.logs)
 
     @cached_property
     def facts(self) -> tuple[LogFacts, ...]:
-        """What results say of each log beside its rows."""
+        """The facts of each log that results state beside its rows."""
         return tuple(log.facts(self.experiment) for log in self.logs)
 
     def find_log(self, name: str) -> StudyLog:
@@ -368,7 +368,7 @@ def run_experiment(
 
 
 def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> StudyTables:
-    study = _gather_study(logs, experiment, gatherer, kept=True)
+    study = _gather_study(logs, experiment, gatherer, reread=True)
     measure = experiment.measure
     study.horizon_s, horizon_notes = settle_horizon(select_counted(study.tally, measure.began), measure.horizon_s)
     study.summary, summary_notes = _summarise(study, study.horizon_s)
@@ -382,14 +382,14 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
     return study
 
 
-def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, kept: bool) -> StudyTables:
-    """Gather all logs, one after the other, with their tally and sums. `kept`: rows are needed again."""
-    study, measure = StudyTables(experiment, tuple(logs), kept), experiment.measure
+def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, reread: bool) -> StudyTables:
+    """Gather all logs, one after the other, with their tally and sums. `reread`: rows are needed again."""
+    study, measure = StudyTables(experiment, tuple(logs), reread), experiment.measure
     if measure.exact:
         study.exact = pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
     nodes = dict[tuple[str, str], list[tuple[int, AccuracyTotal]]]()
     tallies, batch, last = list[pd.DataFrame](), list[PartTables](), logs[-1].name
-    episodes, lists, sliced = list[pd.DataFrame](), list[pd.DataFrame](), bool(kept and measure.by)
+    episodes, lists, sliced = list[pd.DataFrame](), list[pd.DataFrame](), bool(reread and measure.by)
     driving, columns = list[pd.DataFrame](), LISTS_COLUMNS[: None if experiment.needless else -len(OF_DRIVING)]
     for log, parts in groupby(gatherer.each(logs, experiment), key=attrgetter("log")):
         for part in parts:
@@ -430,7 +430,7 @@ def _summarise_slices(study: StudyTables, horizon_s: float) -> pd.DataFrame | No
 
 
 def slice_settings(experiment: Experiment, facts: Mapping[str, ConfigurationFacts], horizon_s: float) -> SliceSettings:
-    """What the figures of groups are computed with."""
+    """The settings from which figures of groups are computed."""
     measure = experiment.measure
     return SliceSettings(
         tuple(experiment.configurations),
@@ -449,7 +449,7 @@ def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gath
     experiment = point.experiment
     if not point.same_units:
         logs = [StudyLog(log.recording, experiment, log.parts) for log in logs]
-    rows, _ = _summarise(_gather_study(logs, experiment, gatherer, kept=False), horizon_s)
+    rows, _ = _summarise(_gather_study(logs, experiment, gatherer, reread=False), horizon_s)
     rows.insert(0, "sweep", point.sweep)
     rows.insert(1, "value", point.value)
     return rows
@@ -459,20 +459,20 @@ def _summarise(study: StudyTables, horizon_s: float) -> tuple[pd.DataFrame, list
     """The rows of a summary, and notes about them."""
     experiment, facts, exact = study.experiment, study.facts, study.exact
     measure, names = experiment.measure, list(experiment.configurations)
-    times = {name: join_list_rates(of.times[name] for of in facts if name in of.times) for name in names}
+    times = {name: join_list_rates(fact.times[name] for fact in facts if name in fact.times) for name in names}
     return summarise_tally(
         select_counted(study.tally, measure.began),
         names,
-        {name: one.rate_hz for name, one in times.items()},
+        {name: rates.rate_hz for name, rates in times.items()},
         horizon_s=horizon_s,
         exact=None if exact is None else select_counted(exact, measure.began),
         accuracy=total_over_logs(study.totals),
         facts=find_facts(experiment),
         own=measure.metrics,
         sums=study.own_sums,
-        outputs={name: sum((of.outputs[name] for of in facts), OutputTimes()) for name in experiment.outputs},
+        outputs={name: sum((fact.outputs[name] for fact in facts), OutputTimes()) for name in experiment.outputs},
         conflicts_asked=measure.conflict is not None,
         weigh=measure.weigh,
         driving=study.driving,
-        links={name: one.links for name, one in times.items() if one.links is not None},
+        links={name: rates.links for name, rates in times.items() if rates.links is not None},
     )

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ConfigurationScores:
-    """The scores of one configuration in the runs (S,), or in the one that stands for all.
+    """The scores of one configuration in the runs (S,), or in one where all are equal.
 
     `issue_s (K,)`: when each list is available. `detections`, `steps`: by match, whatever the fusion. `held`,
     `false_tracks`: with `accuracy`; `needless`: with it where a driver is asked.
@@ -51,28 +51,28 @@ class ConfigurationScores:
     false_tracks: pd.DataFrame | None = None
 
 
-def match_lists(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
-    """Which true object each entry of the fused lists is about, at the instant it tells of."""
-    world = around.at(output.instants.issue_s) if output.tells_of == "now" else _interpolate_told_world(around, output)
+def match_lists(cache: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
+    """The true object that each entry of the fused lists is about, at the instant it tells of."""
+    world = cache.at(output.instants.issue_s) if output.tells_of == "now" else _interpolate_told_world(cache, output)
     gate_m = measure.match.gate_m
-    return match_entries(output.told, world, around.scene, output.origins, gate_m=gate_m, tells_of=output.tells_of)
+    return match_entries(output.told, world, cache.scene, output.origins, gate_m=gate_m, tells_of=output.tells_of)
 
 
-def match_lists_twice(around: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
+def match_lists_twice(cache: TruthCache, output: ReceiverOutput, measure: Measure) -> tuple[Matches, Matches]:
     """Matches at the instants that entries tell of, and at the instants at which their lists are available."""
     if output.tells_of == "now":
-        matches = match_lists(around, output, measure)
+        matches = match_lists(cache, output, measure)
         return matches, matches
-    then, now = _interpolate_told_world(around, output), around.at(output.instants.issue_s)
-    return match_at_both_times(output.told, then, now, around.scene, output.origins, gate_m=measure.match.gate_m)
+    then, now = _interpolate_told_world(cache, output), cache.at(output.instants.issue_s)
+    return match_at_both_times(output.told, then, now, cache.scene, output.origins, gate_m=measure.match.gate_m)
 
 
-def _interpolate_told_world(around: TruthCache, output: ReceiverOutput) -> Tracks:
+def _interpolate_told_world(cache: TruthCache, output: ReceiverOutput) -> Tracks:
     """The truth at the captures that entries tell of."""
     captures_s = _list_captures(output)
     if output.stated is None:
-        return around.at(captures_s)
-    return around.at_stated(captures_s, output.stated.captured_between_s(captures_s))
+        return cache.at(captures_s)
+    return cache.at_stated(captures_s, output.stated.captured_between_s(captures_s))
 
 
 def _list_captures(output: ReceiverOutput) -> Float:
@@ -92,7 +92,7 @@ def _list_captures(output: ReceiverOutput) -> Float:
 
 
 def match_run(around: TruthCache, output: ReceiverOutput, measure: Measure) -> Matches:
-    """As `match_lists`, but that an entry about nobody that is at somebody now is a second entry: it is not false."""
+    """As `match_lists`; but an entry about no object that is at one now is a second entry, not a false one."""
     matches, now = match_lists_twice(around, output, measure)
     somebody = (matches.role == GHOST) & (now.role != GHOST)
     role = np.where(somebody, np.int8(DUPLICATE), matches.role)
@@ -108,7 +108,7 @@ def _match_by_id(matches: Matches, origins: Origins) -> Matches:
 
 
 class Judge:
-    """Measures what the receiver of one configuration issues, chunk by chunk: detection, accuracy and conflicts.
+    """Measures the output of one configuration's receiver, chunk by chunk: detection, accuracy and conflicts.
 
     `issue_s (K,)`: when its lists of the whole log are available. `matches`: whether its lists are matched.
     """
@@ -130,8 +130,8 @@ class Judge:
                 log.ego, log.episodes, measure.conflict, confirm=measure.confirm, count_earlier=measure.count_earlier
             )
 
-    def match(self, around: TruthCache, output: ReceiverOutput) -> tuple[Matches, Matches] | None:
-        """Matches of the lists of a time chunk, whose truth is in `around`; None: they are not asked for.
+    def match(self, cache: TruthCache, output: ReceiverOutput) -> tuple[Matches, Matches] | None:
+        """Matches of the lists of a time chunk, whose truth is in `cache`; None: matches are not needed.
 
         At the instants that entries tell of, and for accuracy at those at which their lists are available.
         """
@@ -139,24 +139,24 @@ class Judge:
             return None
         if self._measure.accuracy:
             began_s = time.perf_counter()
-            both = match_lists_twice(around, output, self._measure)
+            pair = match_lists_twice(cache, output, self._measure)
             self.accuracy_s += time.perf_counter() - began_s
-            return both
-        matches = match_lists(around, output, self._measure)
+            return pair
+        matches = match_lists(cache, output, self._measure)
         return matches, matches
 
-    def measure(self, around: TruthCache, output: ReceiverOutput, both: tuple[Matches, Matches] | None) -> None:
-        """Take in the lists of a time chunk, and what `match` gives of them."""
+    def measure(self, cache: TruthCache, output: ReceiverOutput, pair: tuple[Matches, Matches] | None) -> None:
+        """Add the lists of a time chunk, with the result of `match`."""
         issue_s = output.instants.issue_s
-        if both is not None:
-            lists, (matches, now) = output.lists, both
+        if pair is not None:
+            lists, (matches, now) = output.lists, pair
             if not self._known:
-                self._begin(around, output)
+                self._begin(cache, output)
             if self._aggregator is not None and self._held is not None and self._false is not None:
                 began_s = time.perf_counter()
-                about = _match_by_id(matches, output.origins)
-                self._aggregator.add(lists, about, now, around.at(issue_s))
-                self._false.add(lists, about, now)
+                by_id = _match_by_id(matches, output.origins)
+                self._aggregator.add(lists, by_id, now, cache.at(issue_s))
+                self._false.add(lists, by_id, now)
                 self._held.add(lists, matches)
                 self.accuracy_s += time.perf_counter() - began_s
             if len(object_ix := output.origins.own_ix):  # known by truth ids, however far off
@@ -168,23 +168,23 @@ class Judge:
             for known in self._known:
                 known.add(lists, matches, issue_s, output.origins)
         if self._conflicts is not None:
-            for s, fused_tracks in output.tracks_by_run(both and both[0]):
+            for s, fused_tracks in output.tracks_by_run(pair and pair[0]):
                 self._conflicts.add(fused_tracks, s)
             self._conflicts.next(issue_s)
 
-    def _begin(self, around: TruthCache, output: ReceiverOutput) -> None:
+    def _begin(self, cache: TruthCache, output: ReceiverOutput) -> None:
         """Begin with the first lists, which have the runs of all."""
         measure, episodes, runs = self._measure, self._log.episodes, len(output.lists.start)
         turns = number_turns(output.origin.lists) if measure.confirm.hits > 1 else None
         self._known = [
-            FirstMatches(one, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, turns=turns)
-            for _, one in episodes.passes
+            FirstMatches(part, runs=runs, confirm=measure.confirm, count_earlier=measure.count_earlier, turns=turns)
+            for _, part in episodes.passes
         ]
         if not measure.accuracy:
             return
-        firsts, scene, issue_s = episodes.firsts, around.scene, self._issue_s
-        settings, classes = accuracy_settings(measure, scene.end_s), around.classes(measure)
-        since_s, reference = around.since_s(firsts), around.reference(issue_s)
+        firsts, scene, issue_s = episodes.firsts, cache.scene, self._issue_s
+        settings, classes = accuracy_settings(measure, scene.end_s), cache.classes(measure)
+        since_s, reference = cache.since_s(firsts), cache.reference(issue_s)
         self._aggregator = Aggregator(issue_s, scene, firsts, since_s, reference, classes, settings=settings, runs=runs)
         self._held = HeldErrors(
             self._log.held_frames, issue_s, self._max_age_s, scene, firsts, classes, settings=settings, runs=runs
@@ -196,7 +196,7 @@ class Judge:
             )
 
     def conflict_known_s(self) -> Float | None:
-        """(S | 1, M) when a list first implied a collision, NaN: never; None: it is not asked for."""
+        """(S | 1, M) when a list first implied a collision, NaN: never; None: conflicts are not measured."""
         return None if self._conflicts is None else self._conflicts.result()
 
     def scores(self, runs: int) -> ConfigurationScores | None:

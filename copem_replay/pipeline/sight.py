@@ -1,4 +1,4 @@
-"""Sight at the frames of the truth: what every modelled unit has of some objects, and the body that hides most of them.
+"""Sight at the frames of the truth: how modelled units see the shown objects, and the body that hides most of each.
 
 Lanes, stories and causes name what they name from here. Columns of tables come from the same states, at the lists of
 units (`perception/sight.py`).
@@ -60,7 +60,7 @@ class Sight:
     place_m: Float  # (U, K, 3), of the units
 
     def find_best(self, units: Sequence[int], m: int) -> tuple[Int, Int]:
-        """(K,) the best state that some modelled units have of object m, and whose: of equal ones who sees most."""
+        """(K,) the best state of object m among modelled units, and its unit (K,): of equals the one that sees most."""
         state = self.state[units][:, :, m]
         best = np.argmax(state + 0.5 * np.nan_to_num(self.share[units][:, :, m]), axis=0)
         return state[best, np.arange(len(best))], np.array(units)[best]
@@ -87,19 +87,19 @@ class Span(NamedTuple):
     status: int
 
 
-def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, kept: int = -1) -> list[Span]:
+def smooth_status(elapsed_ns: Int, status: Int, *, end_ns: int | None = None, keep: int = -1) -> list[Span]:
     """The spans of a status (K,) until `end_ns`, none shorter than `STEADY_S`; 0: the object is absent.
 
     A sequence of shorter statuses becomes one span, of the status with the longest total duration. A sequence that is
     too short as a whole continues the span before, unless the object is absent then. The first span of the status
-    `kept` stays, however short.
+    `keep` stays, however short.
     """
     steady_ns = round(STEADY_S * 1e9)
     first = np.flatnonzero(np.diff(status, prepend=-1))
     end_ns = elapsed_ns[-1] + steady_ns if end_ns is None else end_ns
     values, lasts = status[first], np.diff(elapsed_ns[first], append=end_ns)
     long_enough = lasts >= steady_ns
-    long_enough[np.flatnonzero(values == kept)[:1]] = True
+    long_enough[np.flatnonzero(values == keep)[:1]] = True
     spans: list[Span] = []
     k = 0
     while k < len(first):
@@ -132,33 +132,33 @@ class StatusSpan:
 
 
 class SpanNames(NamedTuple):
-    """Names of units, and of bodies as in `Sight.body_ix`."""
+    """Names by unit, and by body as in `Sight.body_ix`."""
 
     units: Sequence[str]
     bodies: Sequence[str]
 
 
 def list_spans(
-    sight: Sight, m: int, told: tuple[Int, ...], names: SpanNames, until_s: float, kept: int = -1
+    sight: Sight, m: int, timeline: tuple[Int, ...], names: SpanNames, until_s: float, keep: int = -1
 ) -> list[StatusSpan]:
-    """The spans of object m until an instant. `kept`: as in `smooth_status`.
+    """The status spans of object m until `until_s`. `keep`: as in `smooth_status`.
 
-    `told`: instants (K,) in ns since the log's start, and at each the status, its unit, −1: none, and the frame.
+    `timeline`: instants (K,) in ns since the log's start, and at each the status, its unit, −1: none, and the frame.
     """
-    begins_ns, status, unit_ix, frame = told
+    begins_ns, status, unit_ix, frame = timeline
     ends_s, spans = np.append(begins_ns * 1e-9, until_s).tolist(), list[StatusSpan]()
-    for first, end, of in smooth_status(begins_ns, status, end_ns=round(until_s * 1e9), kept=kept):
-        rows = np.arange(first, end)[status[first:end] == of]
-        by, body_ix, body = int(np.bincount(unit_ix[rows] + 1).argmax()) - 1, 0, ""
-        if of == HIDDEN:
-            by, body_ix = sight.find_hider(unit_ix[rows], frame[rows], m)
+    for first, end, state in smooth_status(begins_ns, status, end_ns=round(until_s * 1e9), keep=keep):
+        rows = np.arange(first, end)[status[first:end] == state]
+        u, body_ix, body = int(np.bincount(unit_ix[rows] + 1).argmax()) - 1, 0, ""
+        if state == HIDDEN:
+            u, body_ix = sight.find_hider(unit_ix[rows], frame[rows], m)
             body = names.bodies[body_ix]
-        spans.append(StatusSpan(of, ends_s[first], ends_s[end], names.units[by] if by >= 0 else "", body, body_ix))
+        spans.append(StatusSpan(state, ends_s[first], ends_s[end], names.units[u] if u >= 0 else "", body, body_ix))
     return spans
 
 
 def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
-    """The instants, of ascending ones (K,), that hold anywhere between two times."""
+    """Indices of the instants, out of ascending ones (K,), that hold anywhere between two times."""
     time_s = elapsed_ns * 1e-9
     return np.flatnonzero(
         (time_s < until_s - SAME_INSTANT_S) & (np.append(time_s[1:], np.inf) > from_s + SAME_INSTANT_S)
@@ -168,17 +168,17 @@ def within(elapsed_ns: Int, from_s: float, until_s: float) -> Int:
 def list_sight_spans(
     replay: Replay, sight: Sight, m: int, names: Sequence[str], from_s: float, until_s: float
 ) -> list[StatusSpan]:
-    """What the units `names` have of object m between two instants; nothing of recorded units without `views`."""
-    every = list(replay.expanded.units)
+    """The sight of object m by the units `names` between two instants; nothing of recorded units without `views`."""
+    unit_names = list(replay.expanded.units)
     sensing = replay.expanded.list_sensing(names)
-    units = [every.index(name) for name in sensing if name in replay.sighted.modelled]
+    units = [unit_names.index(name) for name in sensing if name in replay.sighted.modelled]
     frames = within(sight.elapsed_ns, from_s, until_s)
     if not units or not len(frames):
         return []
     state, unit_ix = (values[frames] for values in sight.find_best(units, m))
     begins_ns = np.maximum(sight.elapsed_ns[frames], round(from_s * 1e9))
     bodies = name_bodies(replay.scene, sight.solids, replay.scene.object_ids)
-    return list_spans(sight, m, (begins_ns, state, unit_ix, frames), SpanNames(every, bodies), until_s)
+    return list_spans(sight, m, (begins_ns, state, unit_ix, frames), SpanNames(unit_names, bodies), until_s)
 
 
 def name_bodies(scene: Scene, solids: Sequence[str], ids: Sequence[str]) -> list[str]:
@@ -218,7 +218,7 @@ def compute_sight(
 
 
 def find_looked_at(replay: Replay, sight: Sight, object_ix: int, curves: Mapping[str, Curve]) -> dict[str, Bool]:
-    """(K,) by curve of the visible share, whether an object is in a field of view of the curve's units then."""
+    """(K,) by curve of the visible share, whether the object is in a field of view of the curve's units."""
     experiment, m = replay.expanded, int(np.flatnonzero(sight.object_ix == object_ix)[0])
     numbers = {name: u for u, name in enumerate(experiment.units)}
     ego = replay.scene.ego_ix
@@ -293,22 +293,22 @@ def _visible_shares(
     replay: Replay, experiment: Experiment, unit: Unit, poses: UnitPoses, world: Tracks, rows: Int, known_shares: Float
 ) -> Float:
     """(P,) visible shares of rows of the world: the known ones, and all others computed."""
-    on = find_carrier(replay.scene, unit)
-    lacks = np.isnan(known_shares) & poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != on)
+    carrier_ix = find_carrier(replay.scene, unit)
+    lacks = np.isnan(known_shares) & poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != carrier_ix)
     if not lacks.any():
         return known_shares
-    watching = make_observers([poses], np.array([on]))
+    watching = make_observers([poses], np.array([carrier_ix]))
     near, rows = _keep_near_lines(world, poses, rows, lacks, experiment.visibility)
-    asked = np.zeros((1, len(near.frame_ix)), dtype=bool)
-    asked[0, rows[lacks]] = True
-    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, asked)
+    needed = np.zeros((1, len(near.frame_ix)), dtype=bool)
+    needed[0, rows[lacks]] = True
+    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, needed)
     return np.where(lacks, share[rows], known_shares)
 
 
 def _keep_near_lines(
-    world: Tracks, poses: UnitPoses, rows: Int, wanted: Bool, model: VisibilityModel
+    world: Tracks, poses: UnitPoses, rows: Int, needed: Bool, model: VisibilityModel
 ) -> tuple[Tracks, Int]:
-    """The world without bodies that cannot hide any `wanted` row from the unit, and the indices of `rows` in it.
+    """The world without bodies that cannot hide any `needed` row from the unit, and the indices of `rows` in it.
 
     A body hides nothing of a target if it is farther from the line between unit and target than both radii together. A
     visibility model of the user's own gets the whole world.
@@ -319,18 +319,16 @@ def _keep_near_lines(
     order, bounds = world.by_frame
     near = np.zeros(len(world.frame_ix), dtype=bool)
     near[rows] = True
-    targets = rows[wanted & poses.present[world.frame_ix[rows]]]
+    targets = rows[needed & poses.present[world.frame_ix[rows]]]
     frames = world.frame_ix[targets]
     count = np.diff(bounds)[frames]
     target = np.repeat(targets, count)
-    other = order[
-        np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(bounds[frames], count)
-    ]
+    body = order[np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(bounds[frames], count)]
     ux, uy = poses.x_m[world.frame_ix[target]], poses.y_m[world.frame_ix[target]]
     tx, ty = world.x_m[0, target] - ux, world.y_m[0, target] - uy
-    ox, oy = world.x_m[0, other] - ux, world.y_m[0, other] - uy
+    ox, oy = world.x_m[0, body] - ux, world.y_m[0, body] - uy
     along = np.clip((ox * tx + oy * ty) / np.maximum(tx * tx + ty * ty, 1e-12), 0.0, 1.0)
-    near[other[np.hypot(ox - along * tx, oy - along * ty) <= radius_m[target] + radius_m[other] + 1e-6]] = True
+    near[body[np.hypot(ox - along * tx, oy - along * ty) <= radius_m[target] + radius_m[body] + 1e-6]] = True
     return world.take_rows(np.flatnonzero(near)), np.cumsum(near)[rows] - 1
 
 
@@ -354,20 +352,20 @@ def _find_hiders(
 
     `poses`: of the unit at the frames of the `part`.
     """
-    within = np.flatnonzero((sight.state[u, part] == HIDDEN).any(axis=1))
-    if not len(within):
+    hidden = np.flatnonzero((sight.state[u, part] == HIDDEN).any(axis=1))
+    if not len(hidden):
         return
-    frames = part.start + within
+    frames = part.start + hidden
     world = _world_at_frames(replay, experiment, sight.elapsed_ns[frames])
     poses_then = UnitPoses(
-        *(getattr(poses, name)[within] for name in ("x_m", "y_m", "z_m", "heading_rad", "present", "ground_m"))
+        *(getattr(poses, name)[hidden] for name in ("x_m", "y_m", "z_m", "heading_rad", "present", "ground_m"))
     )
     watching = make_observers([poses_then], np.array([find_carrier(replay.scene, unit)]))
     rows, column = _shown_rows(world, sight.object_ix.tolist())
     world, rows = _keep_near_lines(world, poses_then, rows, np.ones(len(rows), dtype=bool), experiment.visibility)
     [hides] = find_blockers(world, replay.placed.static, watching, experiment.visibility)
-    kept = hides[rows] != -1  # nothing hides any of it
-    rows, column = rows[kept], column[kept]
+    is_hidden = hides[rows] != -1  # nothing hides any of it
+    rows, column = rows[is_hidden], column[is_hidden]
     count = len(world.frame_ix)
     body = np.where(hides[rows] >= 0, hides[rows], count - 2 - hides[rows])
     bodies = np.concatenate([world.row_object_ix, -1 - np.arange(len(centres))])

@@ -260,20 +260,20 @@ def _mark_held(
     rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
     row_of[fused.frame_ix[rows]] = rows
     row = row_of[np.searchsorted(elapsed_ns(fused), statuses.elapsed_ns + SAME_INSTANT_NS, side="right") - 1]
-    held = np.flatnonzero(row >= 0)
-    row = row[held]
+    held_at = np.flatnonzero(row >= 0)
+    row = row[held_at]
     captured_s = fused_tracks.captured_s[0, row]
-    statuses.age_of_information_s[held, m] = statuses.elapsed_ns[held] * 1e-9 - captured_s
-    gone = np.isnan(statuses.body["x_m"][held, m])  # absent: the fused position is used
+    statuses.age_of_information_s[held_at, m] = statuses.elapsed_ns[held_at] * 1e-9 - captured_s
+    gone = np.isnan(statuses.body["x_m"][held_at, m])  # absent: the fused position is used
     for name, values in statuses.body.items():
-        values[held[gone], m] = getattr(fused, name)[0, row[gone]]
+        values[held_at[gone], m] = getattr(fused, name)[0, row[gone]]
     too_late = elapsed_ns(fused)[fused.frame_ix[row]] - SAME_INSTANT_NS > clock.ended_ns[object_ix]
     status = np.where(too_late, TOO_LATE, UNCONFIRMED)
     early = captured_s * 1e9 < counts_ns
     status[early] = EARLY
-    status[statuses.elapsed_ns[held] >= clock.known_ns[object_ix]] = KNOWN
-    counting = ~early | (statuses.elapsed_ns[held] < counts_ns) | (status == KNOWN)
-    statuses.status[held[counting], m] = status[counting]
+    status[statuses.elapsed_ns[held_at] >= clock.known_ns[object_ix]] = KNOWN
+    counting = ~early | (statuses.elapsed_ns[held_at] < counts_ns) | (status == KNOWN)
+    statuses.status[held_at[counting], m] = status[counting]
 
 
 def list_status_spans(

@@ -1,4 +1,4 @@
-"""A log of a study: read and prepared where its objects are needed, else known by the facts that were kept of it.
+"""A log of a study: read and prepared where its objects are needed, else known by its cached facts.
 
 The survey of a study's logs: each is read and checked before any run, and not all of them stay in memory.
 """
@@ -49,7 +49,7 @@ _NOT_OF_A_SURVEY = ("logs", "show", "sweep")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class StoredLog(KnownLog):
-    """A log that is known by facts (`said`), its content being read where it is needed (`read`). `about`: their key."""
+    """A log by its cached facts `said`; `read` reads its content when it is needed. `about`: the key of the facts."""
 
     said: Mapping[str, Any]
     read: Callable[[], Recording]
@@ -74,7 +74,7 @@ class StudyLog:
 
     @property
     def known(self) -> Mapping[str, Any] | None:
-        """The facts by which the log is known; None: its content is in memory."""
+        """The cached facts of the log; None: its content is in memory."""
         return self.recording.said if isinstance(self.recording, StoredLog) else None
 
     def replay(self) -> Replay:
@@ -95,15 +95,15 @@ class StudyLog:
             self._whole = read
         return self._whole
 
-    def _check_same(self, read: Recording, about: str) -> None:
-        """Raises RecordingError where the content differs from that of the kept facts, which are then removed."""
-        if (found := read_content_digest(read)) == self.digests["sha256"]:
+    def _check_same(self, read: Recording, key: str) -> None:
+        """Raises RecordingError where the content differs from that of the cached facts, which are then removed."""
+        if (sha := read_content_digest(read)) == self.digests["sha256"]:
             return
-        if self.parts is not None and about:
-            self.parts.forget(about)
+        if self.parts is not None and key:
+            self.parts.forget(key)
         expected = self.digests["sha256"]
         raise RecordingError(
-            f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {found[:12]}…; "
+            f"expected the content that it had when it was read before, SHA-256 {expected[:12]}…, found {sha[:12]}…; "
             "run the command again, and it is replayed as it is now",
             path=first_recording(read.place),
         )
@@ -132,37 +132,37 @@ class StudyLog:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What of the log is in the recipes of its parts: its name, by which draws are addressed, and its content."""
+        """The log's part of a recipe: its name, which is in the addresses of draws, and its content."""
         together = self.recording.together
         ahead_ns = [] if together is None else list(together.ahead_ns)
         named = {"name": self.name, "sha256": self.digests["sha256"], "topic": self.recording.topic}
         return named | {"ahead_ns": ahead_ns}
 
     def facts(self, experiment: Experiment) -> LogFacts:
-        """What the results say of the log beside its rows, in an experiment; kept with the parts."""
+        """The facts of the log that results state beside its rows, in an experiment; cached with the parts."""
         if self._facts is None or self._facts[0] is not experiment:
             self._facts = experiment, self._find_facts(resolve_for_log(experiment, self.name))
         return self._facts[1]
 
-    def _find_facts(self, alone: Experiment) -> LogFacts:
+    def _find_facts(self, local: Experiment) -> LogFacts:
         if self.parts is None:
-            return LogFacts.of(self.whole(), self.replay(), alone)
+            return LogFacts.of(self.whole(), self.replay(), local)
         recording = self.recording
         seen = None if recording.stamps is None else _drop_paths(recording.stamps)
-        about = survey_key(recording.place, alone, seen)
-        asked = isinstance(recording, StoredLog) and recording.about == about
-        kept = self.known if asked else self.parts.known(about)
-        if kept is not None and kept["scene"]["log"] == self.name:
-            return LogFacts.read(kept["facts"])
+        key = survey_key(recording.place, local, seen)
+        is_known = isinstance(recording, StoredLog) and recording.about == key
+        stored = self.known if is_known else self.parts.known(key)
+        if stored is not None and stored["scene"]["log"] == self.name:
+            return LogFacts.read(stored["facts"])
         replay = self.replay()
-        facts = LogFacts.of(self.whole(), replay, alone)
+        facts = LogFacts.of(self.whole(), replay, local)
         notes = [as_finding(note).as_json() for note in recording.notes]
-        said = {
+        facts_json = {
             "scene": scene_as_json(recording.scene), "topic": recording.topic, "notes": notes,
             "host": recording.host_id, **self.digests, "states": self.object_states, "frames": self.frames,
             "facts": facts.as_json(),
         }  # fmt: skip
-        self.parts.keep(about, said)
+        self.parts.keep(key, facts_json)
         return facts
 
 
@@ -172,7 +172,7 @@ def compute_log_digests(recording: Recording) -> dict[str, Any]:
 
 
 def is_made(log: KnownLog) -> bool:
-    """Whether a log is a recording that was made in memory, so that there is no file of it."""
+    """Whether the recording was made in memory, so that no file has it."""
     read = log.stamps is not None or log.sha256 is not None or not isinstance(log, Recording)
     return not read and isinstance(log.local, Path) and not log.local.exists()
 
@@ -192,25 +192,25 @@ def read_content_digest(recording: Recording) -> str:
 
 
 def drop_content(recording: Recording, read: Callable[[], Recording]) -> StoredLog:
-    """What is known of a recording without its content, which `read` reads again where it is needed."""
+    """The facts of a recording without its content, which `read` reads again where it is needed."""
     said = {"states": recording.object_states, "frames": len(recording.truth.stamp_ns)}
     known = {one.name: getattr(recording, one.name) for one in fields(KnownLog)}
     return StoredLog(**known, said=compute_log_digests(recording) | said, read=read)
 
 
-def survey_key(place: Place, experiment: Experiment, seen: Sequence[Stamp] | None = None) -> str:
-    """All that the facts of a log depend on: its files and the experiment, resolved for it, as canonical JSON.
+def survey_key(place: Place, experiment: Experiment, stamps: Sequence[Stamp] | None = None) -> str:
+    """Cache key of a log's survey: its files and the experiment resolved for it, as canonical JSON.
 
-    `seen`: the stamps of the files when they were read; None: those that they have now.
+    `stamps`: the stamps of the files when they were read; None: those that they have now.
     """
-    of_all, own = _survey_parts(experiment)
+    common, components = _survey_parts(experiment)
     ahead_ns = place.ahead_ns if isinstance(place, DriveRecordings) else ()
     return canonical_json(
         {
-            "files": file_stamps(place) if seen is None else seen,
+            "files": file_stamps(place) if stamps is None else stamps,
             "ahead_ns": ahead_ns,
-            "of": of_all,
-            "own": file_digests(own, experiment.read),
+            "of": common,
+            "own": file_digests(components, experiment.read),
         }
     )
 
@@ -223,7 +223,7 @@ def _survey_parts(experiment: Experiment) -> tuple[str, list[Component | MapFile
 
 
 def file_stamps(place: Place) -> list[Stamp]:
-    """The identity and size of each file, and what changes with its content. Raises RecordingError, InputError."""
+    """The identity, the size and a stamp of the content of each file. Raises RecordingError, InputError."""
     if isinstance(place, RemoteFile):  # without a stamp no content is ever taken for the same
         return [(str(place), *(place.stamp or (uuid4().hex,)))]
     return _drop_paths(read_file_stamps(place))
@@ -236,25 +236,25 @@ def _drop_paths(files: Stamps) -> list[Stamp]:
 def recall_log(
     parts: PartCache, place: Place, experiment: Experiment, read: Callable[[], Recording]
 ) -> StoredLog | None:
-    """A log by the facts that are kept of it, in an experiment that is resolved for it; None: none are kept."""
+    """A log from its cached facts, in an experiment that is resolved for it; None: none are cached."""
     try:
-        about = survey_key(place, experiment)
+        key = survey_key(place, experiment)
     except RecordingError:  # reading the recording reports it
         return None
-    if (kept := parts.known(about)) is None:
+    if (facts := parts.known(key)) is None:
         return None
     first = first_recording(place)
     return StoredLog(
-        scene=scene_from_json(kept["scene"]),
+        scene=scene_from_json(facts["scene"]),
         path=Path(first.name) if isinstance(first, RemoteFile) else first,
-        topic=kept["topic"],
-        notes=tuple(Finding(*note) if isinstance(note, list) else note for note in kept["notes"]),
-        host_id=kept["host"],
+        topic=facts["topic"],
+        notes=tuple(Finding(*note) if isinstance(note, list) else note for note in facts["notes"]),
+        host_id=facts["host"],
         together=place if isinstance(place, DriveRecordings) else None,
         remote=place if isinstance(place, RemoteFile) else None,
-        said=kept,
+        said=facts,
         read=read,
-        about=about,
+        about=key,
     )
 
 
@@ -279,11 +279,11 @@ class LogSurvey:
         self._states = 0
 
     def known(self, place: Place, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog | None:
-        """A log by the facts that are kept of it; None: it has to be read."""
+        """A log from its cached facts; None: it has to be read."""
         return None if self.parts is None else recall_log(self.parts, place, experiment, read)
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
-        """A recording that was read, in the experiment resolved for it: as it is, or without its truth and lists.
+        """The log of a recording in the experiment resolved for it: with all content, or without truth and lists.
 
         Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
         """

@@ -30,7 +30,7 @@ SHORTEST_S = 0.001
 
 
 def can_vary(link: LinkModel | None, kind: str) -> bool:
-    """Whether a link has what a sweep of `loss` or `burst_s` varies."""
+    """Whether a sweep of `loss` or `burst_s` can change the link."""
     if not isinstance(link, Radio):
         return False
     if isinstance(link.reception, GilbertElliott):

@@ -76,8 +76,8 @@ def _row_columns(accuracy: Accuracy, assessed: Bool) -> dict[str, Any]:
     sums = _spread(accuracy.by_object, assessed).ravel()
     first = np.tile(assessed, len(accuracy.by_object))
 
-    def mean(name: str, of: str = "pairs") -> Float:
-        return np.where(sums[of] > 0, sums[name] / np.maximum(sums[of], 1), np.nan)
+    def mean(name: str, count: str = "pairs") -> Float:
+        return np.where(sums[count] > 0, sums[name] / np.maximum(sums[count], 1), np.nan)
 
     return {
         "matched_lists": sums["pairs"],
@@ -161,14 +161,14 @@ def tabulate_bands(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> pd.DataF
     return TABLES["bands.csv"].frame(rows)
 
 
-def _band_rows(name: str, by: str, edges: Sequence[float], sums: Any, log: str | None) -> list[dict[str, Any]]:
+def _band_rows(name: str, dimension: str, edges: Sequence[float], sums: Any, log: str | None) -> list[dict[str, Any]]:
     rows = []
     for k, band in enumerate(sums):
         if not (band["looked"] or band["pairs"] or band["ghosts"]):
             continue
         pairs = int(band["pairs"])
         row = {
-            "log": log or "all", "configuration": name, "by": by, "from": edges[k], "to": edges[k + 1],
+            "log": log or "all", "configuration": name, "by": dimension, "from": edges[k], "to": edges[k + 1],
             "looked": int(band["looked"]), "ghosts": int(band["ghosts"]), "pairs": pairs,
             "missed_share": band["missed"] / band["looked"] if band["looked"] else np.nan,
         }  # fmt: skip
@@ -224,14 +224,14 @@ class PartTables:
 
     @property
     def tables(self) -> tuple[pa.Table | None, ...]:
-        """Its tables, those that it has first."""
+        """The tables of the part, the required ones first."""
         return self.rows, self.beside, self.runs, self.false_tracks, self.needless
 
 
 def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experiment) -> list[PartTables]:
     """The part of each configuration, in their order, from blocks of neighbouring runs of one log."""
     names, columns = list(experiment.configurations), add_row_accuracy(*outcomes)
-    counts = [len(one.columns["run"]) // len(names) for one in outcomes]  # rows of a configuration
+    counts = [len(outcome.columns["run"]) // len(names) for outcome in outcomes]  # rows of a configuration
     number = np.concatenate([np.repeat(np.arange(len(names)), count) for count in counts])
     parts = []
     for k, name in enumerate(names):
@@ -243,7 +243,7 @@ def build_parts(log: str, outcomes: Sequence[BlockOutcome], experiment: Experime
         if experiment.measure.accuracy:
             beside = _build_beside(outcomes, name).take(pa.array(order))
             runs = _build_runs(outcomes, name, experiment.needless is not None)
-            accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda one: one[0])]
+            accuracies = [accuracy for _, accuracy in sorted(_split_by_runs(outcomes, name), key=lambda pair: pair[0])]
             false = _tabulate_false_tracks(outcomes, name)
             part = replace(part, beside=beside, runs=runs, total=sum_accuracy(accuracies), false_tracks=false)
         if experiment.needless is not None:
@@ -278,7 +278,7 @@ def _build_beside(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
         assert accuracy is not None
         assert held is not None
         count, existence, steps_s = _count_steps(scores, runs)
-        lists, frames = (np.tile(_spread(of.count, assessed), runs) for of in (accuracy, held))
+        lists, frames = (np.tile(_spread(result.count, assessed), runs) for result in (accuracy, held))
         columns = {
             "first_list": np.tile(_spread(accuracy.first_list, assessed), runs),
             "error_m": (lists, accuracy.error_m.ravel()),
@@ -371,21 +371,21 @@ def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
     """`PartTables.needless` of a configuration, by run and begin."""
     parts = [_EVENTS.empty_table()]
     for outcome in outcomes:
-        if (found := outcome.all_scores[name].needless) is None:  # the log has no ego
+        if (braking := outcome.all_scores[name].needless) is None:  # the log has no ego
             continue
         columns = {
-            "run": outcome.runs[found.run_ix],
-            "begins_s": found.begins_s,
-            "lasts_s": found.lasts_s,
-            "speed_lost_mps": found.lost_mps,
-            "cause": found.cause,
-            "object_id": found.object_id,
-            "object_class": np.array(CLASSES, dtype=object)[found.class_ix],
-            "track_id": [str(k) if k >= 0 else None for k in found.entries["track_id"].tolist()],
-            "x_m": found.entries["x_m"],
-            "y_m": found.entries["y_m"],
+            "run": outcome.runs[braking.run_ix],
+            "begins_s": braking.begins_s,
+            "lasts_s": braking.lasts_s,
+            "speed_lost_mps": braking.lost_mps,
+            "cause": braking.cause,
+            "object_id": braking.object_id,
+            "object_class": np.array(CLASSES, dtype=object)[braking.class_ix],
+            "track_id": [str(k) if k >= 0 else None for k in braking.entries["track_id"].tolist()],
+            "x_m": braking.entries["x_m"],
+            "y_m": braking.entries["y_m"],
         }
-        log, whose = [outcome.log] * len(found.run_ix), [name] * len(found.run_ix)
+        log, whose = [outcome.log] * len(braking.run_ix), [name] * len(braking.run_ix)
         parts.append(pa.table({"log": log, "configuration": whose, **columns}, schema=_EVENTS))
     return pa.concat_tables(parts).sort_by([("run", "ascending"), ("begins_s", "ascending")])
 
@@ -425,13 +425,13 @@ def pack_part(part: PartTables, about: str = "") -> bytes:
     return content
 
 
-def unpack_part(content: bytes, log: str, configuration: str, about: str = "") -> PartTables:
-    """The part that `pack_part` gave. Raises ValueError, KeyError, TypeError or OSError for other bytes or text."""
+def unpack_part(content: bytes, log: str, configuration: str, recipe: str = "") -> PartTables:
+    """The part in bytes of `pack_part`. Raises ValueError, KeyError, TypeError or OSError for other bytes or text."""
     reader, tables = pa.BufferReader(content), list[pa.Table]()
     while reader.tell() < reader.size():
         tables.append(ipc.open_stream(reader).read_all())
     metadata = tables[0].schema.metadata
-    if metadata[b"about"] != about.encode():
+    if metadata[b"about"] != recipe.encode():
         raise ValueError("another recipe")
     total = parse_json(metadata[b"total"])
     for k in (place for place in (0, 2, 3, 4) if place < len(tables)):

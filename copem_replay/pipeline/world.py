@@ -1,4 +1,4 @@
-"""The world in some runs of a log: what units perceive of it, send of that, and when it reaches each receiver."""
+"""The world in some runs of a log: what units perceive and send of it, and when each receiver gets it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ States = Literal["true", "expected", "sampled"]
 
 @dataclass
 class WorldChunk:
-    """A log, or a time chunk of one, in the runs (S,) of a group, as the units of an experiment have it.
+    """A log, or a time chunk of one, in the runs (S,) of a group, as the units of an experiment perceive it.
 
     `observations`: rows of the modelled units. Includes earlier captures that the chunk needs, back to `earliest_s`.
     `complete`: with the rows of all objects and with ghosts, else only of objects with an episode. `sending`: what
@@ -94,7 +94,7 @@ class WorldChunk:
         return draw_ghosts(self.scene, self.observations, self.experiment, self.log.placed, run, between_s)
 
     def listed(self, states: States) -> Tracks:
-        """What all units list, whatever their lists come from: rows of objects, ghosts, then rows of recorded units.
+        """All rows of all units' lists: rows of objects, ghosts, then rows of recorded units.
 
         Ghosts are left out where states are the expected ones: ideal fusion alone has those.
         """
@@ -102,18 +102,18 @@ class WorldChunk:
             scene, experiment, runs = self.scene, self.experiment, self.group.runs
             equipped = self.group.listing
             modelled = [k for k, unit in enumerate(experiment.units.values()) if unit.pem is not None]
-            there = None if equipped.all() else equipped[:, modelled]
-            seen = perceive(scene, self.observations, experiment, runs, states=states, equipped=there)
+            present = None if equipped.all() else equipped[:, modelled]
+            tracks = perceive(scene, self.observations, experiment, runs, states=states, equipped=present)
             if states != "expected" and (ghosts := self.ghosts) is not None:
                 drawn, true = make_ghost_draws(scene, ghosts, experiment, int(runs[0])), ghosts.observations.tracks
-                seen = append_tracks(seen, add_states(scene, true, ghosts.observations, experiment, drawn))
-            seen = remove_outages(scene, self.log.add_recorded(seen, self.recorded), experiment, runs)
+                tracks = append_tracks(tracks, add_states(scene, true, ghosts.observations, experiment, drawn))
+            tracks = remove_outages(scene, self.log.add_recorded(tracks, self.recorded), experiment, runs)
             rng = CounterRng(experiment.seed, scene.log)
-            self._listed[states] = delay_until_ready(seen, experiment.ready, rng, runs)
+            self._listed[states] = delay_until_ready(tracks, experiment.ready, rng, runs)
         return self._listed[states]
 
     def sent(self, states: States) -> Tracks:
-        """What all units send of what they list."""
+        """The listed rows that units send."""
         if self.sending is None:
             return self.listed(states)
         if states not in self._sent:
@@ -125,16 +125,16 @@ class WorldChunk:
 
         Those of time chunks are held until the last one: without states.
         """
-        seen, log = self.listed(states), self.log
+        tracks, log = self.listed(states), self.log
         if len(log.chunks) == 1:
-            return seen
-        own = seen.valid.any(axis=0) & (seen.row_captured_s >= self.chunk.from_s)
-        rows = np.flatnonzero(own & np.isin(seen.row_object_ix, log.episodes.object_ix))
-        return seen.take_rows(rows, states=False)
+            return tracks
+        in_chunk = tracks.valid.any(axis=0) & (tracks.row_captured_s >= self.chunk.from_s)
+        rows = np.flatnonzero(in_chunk & np.isin(tracks.row_object_ix, log.episodes.object_ix))
+        return tracks.take_rows(rows, states=False)
 
     @cached_property
     def words(self) -> Words:
-        """The word of the object or ghost of each row, of those of recorded units a number."""
+        """The address word of each row's object or ghost; of rows of recorded units a number."""
         words = object_words(self.scene.object_ids)[self.observations.tracks.row_object_ix]
         numbers = np.arange(0 if self.recorded is None else len(self.recorded.existence), dtype=np.uint64)
         if self.recorded is not None and self.experiment.fusing:  # one object is one to a unit that fuses
@@ -145,7 +145,7 @@ class WorldChunk:
 
     @cached_property
     def claims(self) -> ClaimedRows:
-        """What the units claim of their rows; the same in all runs where no claim is drawn."""
+        """The claims of the units about their rows; equal in all runs where no claim is drawn."""
         observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
         existence, class_ix = observations.existence, observations.view.class_ix
         claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
@@ -195,7 +195,7 @@ class Transmission:
         self._lists = WorldChunk(log, self.experiment, group, never, log.no_rows, np.inf, False, self._sending)
 
     def world(self, chunk: TimeChunk, earliest_s: float) -> WorldChunk:
-        """A time chunk with captures back to `earliest_s`; that of a log in one is kept."""
+        """A time chunk with captures back to `earliest_s`; cached where it is the whole log."""
         log, world = self.log, self._whole
         if world is None:
             observations = log.observe_listable(chunk, earliest_s, complete=self._complete)
@@ -215,7 +215,7 @@ class Transmission:
         return self._lists.truth
 
     def send(self, sightings: Tracks) -> Tracks:
-        """The rows of objects that are sent, of those that are listed."""
+        """The sent rows of objects, out of the listed ones."""
         if self._sending is None:
             return sightings
         words = object_words(self.log.scene.object_ids)[sightings.row_object_ix]
@@ -224,9 +224,9 @@ class Transmission:
         return self._sending.of(sightings, words)
 
     def arriving(self, name: str) -> Tracks:
-        """The lists that the receiver of a configuration hears, by when links deliver them; those of others never are.
+        """The lists that reach the receiver of a configuration, with the arrival on their links; others never arrive.
 
-        Those of the last configuration are kept. Raises InputError where a link of the user's own fails.
+        Those of the last configuration are cached. Raises InputError where a link of the user's own fails.
         """
         if self._arriving is None or self._arriving[0] != name:
             self._arriving = name, self._transmit(name)
@@ -243,11 +243,11 @@ class Transmission:
         return transmit(lists, experiment.links_of(name), heard, air=air)
 
     def received(self, name: str) -> Tracks:
-        """The lists that the receiver of a configuration hears, by when it takes them in (`issue_hz`)."""
+        """The lists that reach the receiver of a configuration, with the instant it takes each in (`issue_hz`)."""
         return sample_arrivals(self.arriving(name), self.experiment.configurations[name].issue_hz)
 
     def receive(self, rows: Tracks, name: str) -> Tracks:
-        """Rows in the lists that the receiver of a configuration hears; configurations share them and their draws."""
+        """Rows in the lists that reach the receiver of a configuration; configurations share them and their draws."""
         return replace(rows, arrives_s=self.received(name).arrives_s)
 
     def _own_chunks(self) -> Iterator[WorldChunk]:
@@ -274,12 +274,12 @@ class Transmission:
 
 def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
     """Whether a link depends on the path to the receiver. Raises ExperimentError where the path is not known."""
-    asked = False
+    by_path = False
     for name, configuration in experiment.configurations.items():
         for unit_links in experiment.links_of(name):
             if not (isinstance(unit_links.link, Radio) and unit_links.link.loses and unit_links.link.reception.by_path):
                 continue
-            asked, where = True, f"{scene.log}: {unit_links.where}.reception: {unit_links.link.reception.kind}"
+            by_path, where = True, f"{scene.log}: {unit_links.where}.reception: {unit_links.link.reception.kind}"
             if scene.ego_ix < 0:
                 raise ExperimentError(
                     f"{where}: the distance to a receiver is unknown, for the log has no ego; use constant"
@@ -290,7 +290,7 @@ def asks_for_path(experiment: ExpandedExperiment, scene: Scene) -> bool:
             if far:
                 source = "of the truth" if far == [TRUTH] else f"of unit {far[0]}, whose lists are recorded,"
                 raise ExperimentError(f"{where}: the distance {source} to a receiver is not known; use constant")
-    return asked
+    return by_path
 
 
 def has_channel(experiment: ExpandedExperiment) -> bool:
@@ -312,7 +312,7 @@ _VRU = class_indices(("vru",))
 
 
 class ClaimedRows(NamedTuple):
-    """What units claim of rows (P,), as `WorldChunk.listed` has them; `same`: equal where they see one object."""
+    """The claims of units about rows (P,), as `WorldChunk.listed` has them; `same`: equal for one object."""
 
     claims: EntryClaims
     same: Words
@@ -320,17 +320,17 @@ class ClaimedRows(NamedTuple):
 
 @dataclass(frozen=True)
 class SentObjects:
-    """What units send in one run: `lists (F,)` not held back, and `keys` of the rows that `partial (U,)` units send."""
+    """The sent objects of one run: `lists (F,)` not held back, and `keys` of the rows of `partial (U,)` units."""
 
     lists: Bool
     partial: Bool
     keys: Words
 
-    def of(self, seen: Tracks, words: Words) -> Tracks:
+    def of(self, tracks: Tracks, words: Words) -> Tracks:
         """The rows that are sent; `words`: those of their objects."""
-        left_out = self.partial[seen.row_unit_ix] & ~np.isin(_key_rows(seen.frame_ix, words), self.keys)
-        arrives_s = np.where(self.lists, seen.common_arrives_s, np.inf)
-        return replace(seen, valid=seen.valid & ~left_out & self.lists[seen.frame_ix], arrives_s=arrives_s[None])
+        left_out = self.partial[tracks.row_unit_ix] & ~np.isin(_key_rows(tracks.frame_ix, words), self.keys)
+        arrives_s = np.where(self.lists, tracks.common_arrives_s, np.inf)
+        return replace(tracks, valid=tracks.valid & ~left_out & self.lists[tracks.frame_ix], arrives_s=arrives_s[None])
 
 
 def _key_rows(frame_ix: Int, words: Words) -> Words:
@@ -340,7 +340,7 @@ def _key_rows(frame_ix: Int, words: Words) -> Words:
 
 
 def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldChunk]) -> SentObjects:
-    """What units send of the lists of one run, chunk after chunk; lists have the same numbers in all chunks."""
+    """Select the objects that units send in one run, chunk after chunk; lists have the same numbers in all chunks."""
     units = list(experiment.units)
     last = LastSent([experiment.sends.get(name) for name in units])
     sending = np.array([name in experiment.sends for name in units], dtype=bool)
@@ -348,34 +348,34 @@ def select_sent_objects(experiment: ExpandedExperiment, chunks: Iterable[WorldCh
     slots: dict[tuple[int, int], int] = {}
     lists, keys = np.zeros(0, dtype=bool), [np.zeros(0, dtype=np.uint64)]
     for world in chunks:
-        chunk, seen, (claims, same) = world.chunk, world.listed("sampled"), world.claims
+        chunk, tracks, (claims, object_of) = world.chunk, world.listed("sampled"), world.claims
         if not len(lists):
-            lists = np.ones(len(seen.stamp_ns), dtype=bool)
+            lists = np.ones(len(tracks.stamp_ns), dtype=bool)
         frames = np.flatnonzero(
-            sending[seen.frame_unit_ix] & np.isfinite(seen.common_arrives_s)
-            & (seen.captured_s >= chunk.from_s) & (seen.captured_s < chunk.until_s)
+            sending[tracks.frame_unit_ix] & np.isfinite(tracks.common_arrives_s)
+            & (tracks.captured_s >= chunk.from_s) & (tracks.captured_s < chunk.until_s)
         )  # fmt: skip
-        frames = frames[np.argsort(seen.captured_s[frames], kind="stable")]
-        order, bounds = seen.by_frame
+        frames = frames[np.argsort(tracks.captured_s[frames], kind="stable")]
+        order, bounds = tracks.by_frame
         counts = np.diff(bounds)[frames]
         begin = np.cumsum(counts) - counts
         listed = order[np.repeat(bounds[frames] - begin, counts) + np.arange(counts.sum())]
-        valid = seen.valid[0, listed]
+        valid = tracks.valid[0, listed]
         start = np.append(0, np.cumsum(valid))[np.append(begin, len(listed))]
         listed = listed[valid]
-        pairs, which = np.unique(
-            np.stack([seen.row_unit_ix[listed].astype(np.uint64), same[listed]]), axis=1, return_inverse=True
+        pairs, pair_ix = np.unique(
+            np.stack([tracks.row_unit_ix[listed].astype(np.uint64), object_of[listed]]), axis=1, return_inverse=True
         )
         slot = np.array([slots.setdefault((u, w), len(slots)) for u, w in pairs.T.tolist()], dtype=np.int64)
         sent, included = last.choose(
             ListedObjects(
-                start, seen.frame_unit_ix[frames], seen.captured_s[frames], slot[which.ravel()], world.words[listed],
-                np.isin(claims.class_probability[listed].argmax(axis=1), _VRU), _sampled_states(seen, listed),
-                claims.existence[listed],
+                start, tracks.frame_unit_ix[frames], tracks.captured_s[frames], slot[pair_ix.ravel()],
+                world.words[listed], np.isin(claims.class_probability[listed].argmax(axis=1), _VRU),
+                _sampled_states(tracks, listed), claims.existence[listed],
             )
         )  # fmt: skip
         lists[frames[~sent]] = False
-        keys.append(_key_rows(seen.frame_ix[listed[included]], world.words[listed[included]]))
+        keys.append(_key_rows(tracks.frame_ix[listed[included]], world.words[listed[included]]))
     return SentObjects(lists, partial, np.sort(np.concatenate(keys)))
 
 

@@ -18,7 +18,7 @@ from copem_replay.results.read import Results
 def replay_again(
     results: Results, log: str, run: int, configurations: Collection[str]
 ) -> tuple[ReplayedRun, pd.DataFrame]:
-    """A run of these configurations, and its rows of `detections.parquet`. Raises InputError if they differ."""
+    """One run of these configurations and its rows of `detections.parquet`. Raises InputError if they differ."""
     alone = resolve_for_log(results.experiment, log)
     chosen = {name: configuration for name, configuration in alone.configurations.items() if name in configurations}
     experiment = alone.model_copy(update={"configurations": chosen, "sweep": None})

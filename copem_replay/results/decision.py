@@ -86,20 +86,20 @@ def decide(results: Results, comparison: Comparison | None = None, verdicts: Jud
     share = results.summary.set_index("configuration")["detected_share"]
     if not share[names].any():
         others = "" if len(names) == len(results.facts) else " (only the ground truth has them)"
-        found = Decision((f"No configuration detects any measured object in any run{others}.",))
+        decision = Decision((f"No configuration detects any measured object in any run{others}.",))
     elif len(names) == 1:
-        found = _describe_single(results, names[0])
+        decision = _describe_single(results, names[0])
     else:
         driven = (SHARE,) if SHARE in results.summary else ()
         comparison = comparison or compare_folders([results], metrics=(*DECIDED_BY, *driven), asked=_OVERALL)
         compared = [name for name in names if name in (comparison.baseline, *comparison.configurations)]
         parts = () if comparison.baseline_why is None else tuple(_tell_parts(results, comparison, compared))
-        found = decide_compared(comparison, results, parts)
-    return found if verdicts is None else Decision((describe_verdicts(verdicts),), found.best)
+        decision = decide_compared(comparison, results, parts)
+    return decision if verdicts is None else Decision((describe_verdicts(verdicts),), decision.best)
 
 
 def describe_verdicts(verdicts: Judgement) -> str:
-    """Whether results are good enough, by all criteria; of those that do not pass the first is named."""
+    """Whether results are good enough by all criteria; of those that do not pass, the first is named."""
     number, failing = len(verdicts.all), [one for one in verdicts.all if not one.passes]
     if not failing:
         return "Good enough: the one verdict passes." if number == 1 else f"Good enough: all {number} verdicts pass."
@@ -159,11 +159,11 @@ class _Scale:
         if self.is_share:
             size, limits = 100 * pair.difference, tuple(100 * limit for limit in pair.limits)
             unit, limits = " percentage points", tuple(sorted(map(abs, limits))) if claimed else limits
-            told = format_limit(abs(size)) if claimed else f"{'+' if size > 0 else ''}{format_limit(size)}"
-            shown = f"{told}{unit} {format_limits(*limits)}"
+            text = format_limit(abs(size)) if claimed else f"{'+' if size > 0 else ''}{format_limit(size)}"
+            shown = f"{text}{unit} {format_limits(*limits)}"
         else:
-            told = tell_seconds(pair.difference, *pair.limits)
-            shown = told.replace(" later", "").replace(" sooner", "") if claimed else told
+            text = tell_seconds(pair.difference, *pair.limits)
+            shown = text.replace(" later", "").replace(" sooner", "") if claimed else text
         shown = shown if pair.word else shown.partition(" [")[0]
         return f"by {shown}" if claimed else shown
 
@@ -198,16 +198,16 @@ def decide_compared(comparison: Comparison, results: Results | None = None, part
         return Decision((f"There is no answer: nothing can be held against {comparison.baseline}, the truth.",))
     if not pairs:
         return Decision((f"There is no answer: no log has both {comparison.baseline} and another configuration.",))
-    brakers, needless = _tell_needless(comparison, results)
+    brakers, braking = _tell_needless(comparison, results)
     gains = {name: scale.gain(pair.difference) for name, pair in pairs.items()} | {comparison.baseline: 0.0}
     gains = {name: gain for name, gain in gains.items() if name not in brakers}
     best = [name for name, gain in gains.items() if not scale.matters(max(gains.values()) - gain)]
     if comparison.baseline in gains and any(name in pairs and pairs[name].word == OPEN for name in best):
         best = [*dict.fromkeys([*best, comparison.baseline])]
     if not parts:
-        told = _tell_latencies(comparison.baseline, pairs, scale, None if results is None else results.experiment)
-        parts = (f"{told or _tell_groups(comparison.baseline, pairs, scale, brakers)}.",)
-    return Decision((*parts, *([needless] if needless else [])), tuple(best))
+        words = _tell_latencies(comparison.baseline, pairs, scale, None if results is None else results.experiment)
+        parts = (f"{words or _tell_groups(comparison.baseline, pairs, scale, brakers)}.",)
+    return Decision((*parts, *([braking] if braking else [])), tuple(best))
 
 
 def _judge_pairs(comparison: Comparison, scale: _Scale | None = None) -> tuple[_Scale, dict[str, _JudgedPair]]:
@@ -263,7 +263,7 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
     """
     better, worse = ("Better", "Worse") if scale.is_share else ("Sooner", "Later")
     bases = [pair.base for pair in pairs.values()]
-    held = (
+    baseline_words = (
         f"{baseline} ({scale.say(bases[0]).removeprefix('an object is ')})"
         if max(bases) - min(bases) <= NOTHING
         else baseline
@@ -285,7 +285,7 @@ def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale,
     for word, head in heads.items():
         group = {name: pair for name, pair in pairs.items() if words[name] == word}
         if group:
-            told = head.format(baseline if parts else held) + _list_pairs(group, scale)
+            told = head.format(baseline if parts else baseline_words) + _list_pairs(group, scale)
             parts.append(told if not parts else told[:1].lower() + told[1:])
     return "; ".join(parts)
 
@@ -304,11 +304,11 @@ def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
     most = _NAMED if len(pairs) > _NAMED + 1 else len(pairs)  # one more takes no more room than to say so
     shown, left, more = [], most, len(pairs) - most
     for words, names in by_words.items():
-        kept = names[:left]
-        left -= len(kept)
-        if kept:
-            several = len(kept) > 1 and (words or more <= 0)  # else `and 3 more` ends the list
-            listed = f"{', '.join(kept[:-1])} and {kept[-1]}" if several else ", ".join(kept)
+        named = names[:left]
+        left -= len(named)
+        if named:
+            several = len(named) > 1 and (words or more <= 0)  # else `and 3 more` ends the list
+            listed = f"{', '.join(named[:-1])} and {named[-1]}" if several else ", ".join(named)
             shown.append(f"{listed} {words}".rstrip())
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
 
@@ -323,34 +323,34 @@ def _tell_parts(results: Results, comparison: Comparison, names: Sequence[str]) 
     Without a car alone (`find_alone`), or where none of `names` has another unit, fusion and latency if that is all.
     """
     alone, experiment = find_alone(results, names) or "", results.experiment
-    own = {*experiment.units_of(experiment.configurations[alone])} if alone else set()
+    base = {*experiment.units_of(experiment.configurations[alone])} if alone else set()
     inputs = {name: set(experiment.units_of(of)) for name, of in experiment.configurations.items() if name in names}
     on_ego = {unit for unit, of in experiment.units.items() if of.on == "ego"}
-    together = {name for name in names if alone and (inputs[name] - on_ego if own <= on_ego else inputs[name] > own)}
+    joint = {name for name in names if alone and (inputs[name] - on_ego if base <= on_ego else inputs[name] > base)}
     ideals = {n: str(of.ideal) for n in names if (of := results.facts[n]).ideal_of == "inputs" and of.ideal in names}
-    if not together and (not ideals or {*names} - {*ideals, *ideals.values(), *_find_twins(experiment, names)}):
+    if not joint and (not ideals or {*names} - {*ideals, *ideals.values(), *_find_twins(experiment, names)}):
         return
     (scale, first), brakers = _judge_pairs(comparison), _tell_needless(comparison, None)[0]
     known: dict[tuple[str, str], _JudgedPair | None] = {(of, comparison.baseline): pair for of, pair in first.items()}
     hold = partial(_hold_against, results, scale=scale, known=known)
-    shown = [name for name in names if name in together - {*ideals.values()}]
-    hold({name: alone for name in names if together and name not in {alone, *ideals.values()}})  # all at once
+    shown = [name for name in names if name in joint - {*ideals.values()}]
+    hold({name: alone for name in names if joint and name not in {alone, *ideals.values()}})  # all at once
     pairs = hold(dict.fromkeys(shown, alone))
     latencies = _tell_latencies(alone, pairs, scale, experiment)
     if pairs:
-        told = latencies or f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}"
-        yield f"{told}."
+        sentence = latencies or f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}"
+        yield f"{sentence}."
     elif shown:
         yield f"Cooperation: not known, for no log has both {alone} and {' or '.join(shown[:_NAMED])}."
     if ideals and (fused := hold(ideals)):
         [*against] = {*ideals.values()}
-        told = _tell_groups(against[0] if len(against) == 1 else _IDEAL, fused, scale, brakers)
-        yield f"Fusion: {_start_low(told)}."
+        sentence = _tell_groups(against[0] if len(against) == 1 else _IDEAL, fused, scale, brakers)
+        yield f"Fusion: {_start_low(sentence)}."
     twins = {} if latencies else _find_twins(experiment, names)
     if late := hold({name: twin for name, (twin, _) in twins.items()}):
         yield f"Latency: {_tell_costs(late, twins, scale)}."
-    rest = [name for name in names if name not in {alone, *shown, *ideals, *ideals.values(), *twins}]
-    if together and (beside := hold(dict.fromkeys(rest, alone))):
+    remaining = [name for name in names if name not in {alone, *shown, *ideals, *ideals.values(), *twins}]
+    if joint and (beside := hold(dict.fromkeys(remaining, alone))):
         yield f"Beside them: {_start_low(_tell_groups(alone, beside, scale, brakers))}."
 
 
@@ -359,17 +359,17 @@ def _start_low(sentence: str) -> str:
 
 
 def _hold_against(
-    results: Results, against: Mapping[str, str], scale: _Scale, known: dict[tuple[str, str], _JudgedPair | None]
+    results: Results, baseline_of: Mapping[str, str], scale: _Scale, known: dict[tuple[str, str], _JudgedPair | None]
 ) -> dict[str, _JudgedPair]:
     """Configurations, each against another one, where both have rows. `known`: pairs compared before, and now."""
-    for baseline in dict.fromkeys(pair[1] for pair in against.items() if pair not in known):
-        names = [name for name, other in against.items() if other == baseline and (name, other) not in known]
+    for baseline in dict.fromkeys(pair[1] for pair in baseline_of.items() if pair not in known):
+        names = [name for name, other in baseline_of.items() if other == baseline and (name, other) not in known]
         compared = compare_folders(
             [results], configurations=names, baseline=baseline, metrics=(scale.metric,), asked=_OVERALL
         )
-        found = _judge_pairs(compared, scale)[1]
-        known.update({(name, baseline): found.get(name) for name in names})
-    return {name: pair for name, other in against.items() if (pair := known[name, other]) is not None}
+        judged = _judge_pairs(compared, scale)[1]
+        known.update({(name, baseline): judged.get(name) for name in names})
+    return {name: pair for name, other in baseline_of.items() if (pair := known[name, other]) is not None}
 
 
 def _find_twins(experiment: Experiment, names: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -387,14 +387,14 @@ def _group_by_latency(experiment: Experiment, names: Iterable[str]) -> list[dict
     """Latencies of configurations that differ in nothing else, group by group, the smallest first."""
     groups: list[tuple[Configuration, dict[str, float]]] = []
     for name in names:
-        own = experiment.configurations[name]
-        if own.recorded is not None or isinstance(own.latency_s, dict):
+        configuration = experiment.configurations[name]
+        if configuration.recorded is not None or isinstance(configuration.latency_s, dict):
             continue
-        plain = own.model_copy(update={"latency_s": 0.0})
+        plain = configuration.model_copy(update={"latency_s": 0.0})
         latencies_s = next((of_alike for of, of_alike in groups if of == plain), None)
         if latencies_s is None:
             groups.append((plain, latencies_s := {}))
-        latencies_s[name] = own.latency_s
+        latencies_s[name] = configuration.latency_s
     return [dict(sorted(latencies_s.items(), key=itemgetter(1))) for _, latencies_s in groups]
 
 
@@ -426,36 +426,36 @@ def _tell_needless(comparison: Comparison, results: Results | None) -> tuple[set
     rows = comparison.overall[comparison.overall["metric"] == SHARE]
     rows = rows[~rows["configuration"].isin(comparison.truths) & rows["difference"].notna()]
     shown = rows["low"].isna() | (rows["low"] > NOTHING) | (rows["high"] < -NOTHING)
-    apart = rows[shown & (rows["difference"].abs() >= MATTERS[SHARE])]
-    shorter, against = apart[apart["difference"] < 0], comparison.baseline
+    differing = rows[shown & (rows["difference"].abs() >= MATTERS[SHARE])]
+    shorter, reference = differing[differing["difference"] < 0], comparison.baseline
     brakers = dict(zip(rows["configuration"], rows["value"].astype(float), strict=True))
     if len(shorter):  # the baseline brakes, and with it whoever is not shown to brake less
         best = shorter.loc[shorter["value"].idxmin()]
-        against, least = str(best["configuration"]), float(best["value"])
+        reference, least = str(best["configuration"]), float(best["value"])
         brakers[comparison.baseline] = float(shorter["baseline_value"].max())
         for name in shorter["configuration"]:
             del brakers[name]
         brakers = {name: share for name, share in brakers.items() if share - least >= MATTERS[SHARE]}
     else:
         least = float(rows["baseline_value"].min()) if len(rows) else 0.0
-        longer = set(apart["configuration"])
+        longer = set(differing["configuration"])
         brakers = {name: share for name, share in brakers.items() if name in longer}
-    of = None if results is None or SHARE not in results.summary else results.summary.set_index("configuration")
+    summary = None if results is None or SHARE not in results.summary else results.summary.set_index("configuration")
     names = sorted(brakers, key=lambda name: -brakers[name])
     if not names:
-        alike = [] if of is None else [*of.index[of[SHARE] >= MATTERS[SHARE]]]
+        alike = [] if summary is None else [*summary.index[summary[SHARE] >= MATTERS[SHARE]]]
         because = _explain_braking(results, alike)
         return set(), f"The driver brakes for nothing{because}." if because else ""
-    h = 0.0 if of is None else float(of["driving_h"].max())
-    driving = "the driving time" if of is None else f"these {3600 * h:.3g} s" if h < 0.25 else f"these {h:.3g} h"
-    driving += "" if of is None else " of driving"
-    told = f"But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
-    told += "".join(f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED])
-    told += f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    told += f" ({against}: {'never' if least == 0 else _format_share(least)})"
-    if of is not None:
-        told += f", losing up to {of.loc[names, 'needless_speed_lost_max_mps'].max():.3g} m/s at a time"
-    return set(brakers), f"{told}{_explain_braking(results, names)}."
+    h = 0.0 if summary is None else float(summary["driving_h"].max())
+    driving = "the driving time" if summary is None else f"these {3600 * h:.3g} s" if h < 0.25 else f"these {h:.3g} h"
+    driving += "" if summary is None else " of driving"
+    sentence = f"But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
+    sentence += "".join(f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED])
+    sentence += f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    sentence += f" ({reference}: {'never' if least == 0 else _format_share(least)})"
+    if summary is not None:
+        sentence += f", losing up to {summary.loc[names, 'needless_speed_lost_max_mps'].max():.3g} m/s at a time"
+    return set(brakers), f"{sentence}{_explain_braking(results, names)}."
 
 
 def _explain_braking(results: Results | None, names: Collection[str]) -> str:
@@ -489,24 +489,24 @@ def _tell_latencies(
     if sorted(judged, key=order.index) != judged or max(bases) - min(bases) > NOTHING:
         return None  # not in the order of latencies, or not over the same rows: each has to be named
     cooperates = units > set(experiment.units_of(experiment.configurations[baseline]))
-    what, none = (
+    subject, reference = (
         ("cooperation", baseline if "alone" in baseline else f"{baseline} alone")
         if cooperates
         else (names[0].partition(":")[0], baseline)
     )
     parts: list[str] = []
-    for word, says in ((BETTER, f"{what} helps"), (OPEN, f"no difference to {none} is shown")):
+    for word, says in ((BETTER, f"{subject} helps"), (OPEN, f"no difference to {reference} is shown")):
         if word in judged:
             first, *_, last = [name for name in names if pairs[name].word == word] * 2
             at = "up to" if word == BETTER else "at" if first == last else f"from {latencies_s[first]:g} to"
             at = f"{at} {latencies_s[last]:g} s of latency" if latencies_s[last] else "without latency"
-            parts.append(f"{at} {says}: {_tell_against(pairs[last], scale, none, first=not parts)}")
+            parts.append(f"{at} {says}: {_tell_against(pairs[last], scale, reference, first=not parts)}")
     if WORSE in judged:
         first = names[judged.index(WORSE)]
-        told = _tell_against(pairs[first], scale, none, first=not parts)
-        parts.append(f"from {latencies_s[first]:g} s of latency on {what} is worse than {none}: {told}")
-    told = "; ".join(parts)
-    return told[:1].upper() + told[1:]
+        sentence = _tell_against(pairs[first], scale, reference, first=not parts)
+        parts.append(f"from {latencies_s[first]:g} s of latency on {subject} is worse than {reference}: {sentence}")
+    sentence = "; ".join(parts)
+    return sentence[:1].upper() + sentence[1:]
 
 
 def _tell_against(pair: _JudgedPair, scale: _Scale, none: str, *, first: bool) -> str:

@@ -61,7 +61,7 @@ class FolderFiles:
     made: frozenset[str]
 
     def is_ours(self, name: str) -> bool:
-        """Whether a file, or one in the folder of this name, is listed."""
+        """Whether the lists have this file, or a file in the folder of this name."""
         return any(one == name or one.startswith(f"{name}/") for one in (self.results or frozenset()) | self.made)
 
     def list_others(self, folder: Path, written: Collection[str]) -> list[str]:
@@ -71,7 +71,7 @@ class FolderFiles:
 
 
 def list_belongings(folder: Path) -> FolderFiles | None:
-    """The files of a results folder; None: it is not one."""
+    """The listed files of a results folder; None: it is no results folder."""
     try:
         provenance: Any = parse_json((folder / MARK).read_bytes())
     except (OSError, ValueError):
@@ -221,7 +221,7 @@ class ResultsPlace:
 
     @property
     def shown(self) -> Path:
-        """The folder of the results, as it was given where they are there."""
+        """The folder of the results, in the user's spelling unless they had to go elsewhere."""
         return self.asked if self.folder == self.asked_folder else self.folder
 
     @property
@@ -273,35 +273,35 @@ class ResultsPlace:
             self._put_elsewhere()
         flush_file(self.folder.parent)
 
-    def _replace(self, files: Sequence[str], seen: os.stat_result) -> bool:
+    def _replace(self, files: Sequence[str], old_stat: os.stat_result) -> bool:
         """Put the new folder in the place of the old one, with the user's own files. False: it cannot be."""
-        held = list_belongings(self.folder)
-        if held is None or find_taken(held.list_others(self.folder, files), files):
+        belongings = list_belongings(self.folder)
+        if belongings is None or find_taken(belongings.list_others(self.folder, files), files):
             return False
-        others = held.list_others(self.folder, files)
-        self.scratch.may_remove({*list_names(self.folder), *files}.difference(others))
+        own_files = belongings.list_others(self.folder, files)
+        self.scratch.may_remove({*list_names(self.folder), *files}.difference(own_files))
 
         def list_others(folder: Path) -> list[str]:  # more may come, and more be made, meanwhile
-            return (list_belongings(folder) or held).list_others(folder, files)
+            return (list_belongings(folder) or belongings).list_others(folder, files)
 
-        stay = replace_folder(self.scratch, self.folder, list_others, seen)
-        self.notes += [f"{self.asked}/{line}" for line in stay or ()]
-        if stay is None:
-            for name in set(others).difference(files):
+        staying = replace_folder(self.scratch, self.folder, list_others, old_stat)
+        self.notes += [f"{self.asked}/{line}" for line in staying or ()]
+        if staying is None:
+            for name in set(own_files).difference(files):
                 with suppress(OSError):
                     (self.new / name).unlink()
-        return stay is not None
+        return staying is not None
 
     def _put_elsewhere(self) -> None:
         """Give the new folder another name."""
         number = 2
         while True:
-            other = self.asked_folder.with_name(f"{self.asked_folder.name}-{number}")
-            if not os.path.lexists(other) and _try_rename(self.new, other):
+            new_folder = self.asked_folder.with_name(f"{self.asked_folder.name}-{number}")
+            if not os.path.lexists(new_folder) and _try_rename(self.new, new_folder):
                 break
             number += 1
-        self.notes.append(f"{self.asked}: {_OTHERS}; the results of this run are in {other}")
-        self.folder = other
+        self.notes.append(f"{self.asked}: {_OTHERS}; the results of this run are in {new_folder}")
+        self.folder = new_folder
 
 
 def _stat_folder(path: Path) -> os.stat_result | None:
@@ -383,7 +383,7 @@ def check_target(folder: Path, *, overwrite: bool) -> None:
 
 
 def find_taken(others: Iterable[str], files: Collection[str]) -> list[str]:
-    """The user's own files whose names the results need, themselves or for a folder."""
+    """The user's own files that have a name which the results need, as a file or as a folder."""
     folders = {parent.as_posix() for file in files for parent in Path(file).parents}
     taken = folders.union(files)
     return [n for n in others if n in taken or any(parent.as_posix() in files for parent in Path(n).parents)]
@@ -401,12 +401,12 @@ def check_names(place: ResultsPlace, files: Sequence[str]) -> None:
 
 def check_inputs(place: ResultsPlace, inputs: Sequence[Path]) -> None:
     """Raise OutputError where an input of the run would go with the folder that is replaced."""
-    held = None if place.before is None else list_belongings(place.folder)
+    belongings = None if place.before is None else list_belongings(place.folder)
     for path in inputs if place.before is not None else ():
         if not path.resolve().is_relative_to(place.folder):
             continue
         name = path.resolve().relative_to(place.folder).as_posix()
-        goes = held is None or held.results is None or held.is_ours(name)
+        goes = belongings is None or belongings.results is None or belongings.is_ours(name)
         if goes and name != EXPERIMENT:
             raise OutputError(
                 f"{place.asked}: {path} is in this folder and would be removed; choose another folder with --out"

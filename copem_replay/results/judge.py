@@ -56,9 +56,9 @@ from copem_replay.results.slices import read_slices, read_study_rows
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict, judge_limits
 
 CLOSED_FORM = "closed form"
-"""The kind of an interval of what is computed without a draw: of these logs it is known."""
+"""The kind of interval of a figure in closed form: exact for these logs."""
 FEWEST_RUNS = 30
-"""Over fewer runs there is no interval of what several objects give."""
+"""With fewer runs a figure over several objects has no interval."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +117,14 @@ def judge_own_criteria(results: Results) -> Judgement | None:
 
 
 def find_population(results: Results) -> str:
-    """Of what population `compare` has intervals: those over the runs of a single object are of these logs."""
+    """The population of `compare`'s intervals: these logs where they are over runs of one object, else such traffic."""
     clusters = find_clusters(results.known)
     return "these_logs" if clusters is not None and clusters.by_run else "such_traffic"
 
 
-def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, found: JudgedFigure) -> Verdict:
-    figure = found.figure
-    word, why = _find_verdict(criterion, found)
+def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, item: JudgedFigure) -> Verdict:
+    figure = item.figure
+    word, why = _find_verdict(criterion, item)
     passes = word == MET or (word == UNDECIDED and criterion.passes_unless_refuted)
     other, of_before = criterion.find_against(configuration, (criterion.against or "",))
     return Verdict(
@@ -141,9 +141,9 @@ def _make_verdict(name: str, criterion: Criterion, configuration: str, group: st
         low=_finite(figure.low),
         high=_finite(figure.high),
         interval=figure.kind,
-        over=found.over,
-        clusters=found.clusters,
-        n=found.n,
+        over=item.over,
+        clusters=item.clusters,
+        n=item.n,
         verdict=word,
         passes=passes or (word == NOT_MEASURED and criterion.if_absent == "pass"),
         why=why,
@@ -154,35 +154,35 @@ def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _find_verdict(criterion: Criterion, found: JudgedFigure) -> tuple[str, str]:
+def _find_verdict(criterion: Criterion, item: JudgedFigure) -> tuple[str, str]:
     """The word, and why."""
-    figure, bound, direction = found.figure, criterion.bound, criterion.direction
+    figure, bound, direction = item.figure, criterion.bound, criterion.direction
     if figure.value is None:
-        return NOT_MEASURED, found.why or "no row has a value"
+        return NOT_MEASURED, item.why or "no row has a value"
     if figure.kind == ALL_ALIKE:
         good = judge_limits(figure.value, figure.value, bound, direction) == MET
         why = "the same throughout, so how it varies is not known"
         return (UNDECIDED if good else NOT_MET), why
     if figure.kind is None or math.isnan(figure.low) or math.isnan(figure.high):
-        return NOT_MEASURED, found.why or "no interval"
+        return NOT_MEASURED, item.why or "no interval"
     word = judge_limits(figure.low, figure.high, bound, direction)
     parts = [] if figure.share is None else [_describe_share(criterion, figure.share)]
     if word == UNDECIDED:
-        parts.append(_describe_deciding(criterion, found))
-    return word, "; ".join([*parts, *filter(None, [found.why, found.shorter if word == UNDECIDED else ""])])
+        parts.append(_describe_deciding(criterion, item))
+    return word, "; ".join([*parts, *filter(None, [item.why, item.shorter if word == UNDECIDED else ""])])
 
 
 _AT_BOUND = 1e-9
 """A figure this close to its bound is at it."""
 
 
-def _describe_deciding(criterion: Criterion, found: JudgedFigure) -> str:
+def _describe_deciding(criterion: Criterion, item: JudgedFigure) -> str:
     """How many logs, objects, passes or runs would decide: `about 57 objects like these would decide, 13 now`."""
-    over, number = found.over or "logs", found.clusters or 0
-    known = Known(over, number, found.units)
+    over, number = item.over or "logs", item.clusters or 0
+    known = Known(over, number, item.units)
     paired = criterion.against is not None
-    needed = count_deciding(criterion.metric, found.figure, criterion.bound, known, criterion.confidence, paired=paired)
-    if needed is None and abs((found.figure.value or 0.0) - criterion.bound) <= _AT_BOUND:
+    needed = count_deciding(criterion.metric, item.figure, criterion.bound, known, criterion.confidence, paired=paired)
+    if needed is None and abs((item.figure.value or 0.0) - criterion.bound) <= _AT_BOUND:
         return f"no number of {over} decides: it is at the bound ({number} now)"
     if needed is None:
         return f"more {over} would decide, how many is not known ({number} now)"
@@ -237,13 +237,13 @@ class _JudgedStudy:
     def runs(self) -> StudyRows:
         """The rows run by run, those of the tally with a column `run`."""
         tables, sums = [], []
-        own = self.traffic.settings.own
+        metrics = self.traffic.settings.own
         for log in self.results.rows.logs:
             (rows,) = self.results.each(log=log, every=True)
             rows = rows.assign(log=log)
             tables.append(list_runs(rows))
             if self._of_rows:
-                sums.append(sum_episodes(rows, own, self.traffic.settings.words, "run"))
+                sums.append(sum_episodes(rows, metrics, self.traffic.settings.words, "run"))
         tally = pd.concat(tables, ignore_index=True) if tables else self.traffic.tally
         lists = self.traffic.lists
         if lists is not None:
@@ -269,19 +269,19 @@ class _JudgedStudy:
     def _make_groups(self, name: str, criterion: Criterion) -> list[_JudgedGroup]:
         study = self.runs if criterion.of_runs else self.traffic
         episodes = study.episodes
-        kept, logs = self._choose_episodes(name, criterion, episodes)
+        is_chosen, logs = self._choose_episodes(name, criterion, episodes)
         rows = study
         if criterion.objects is not None or criterion.logs is not None:
-            rows = study.select(kept, None if criterion.objects is not None else logs)
+            rows = study.select(is_chosen, None if criterion.objects is not None else logs)
         if criterion.by is None and criterion.each is None:
-            whole = rows is study
-            return [_JudgedGroup("", rows, None if whole else _list_episodes(rows, whole=criterion.objects is None))]
-        by = self.slice_of(name, criterion)
-        groups = rows.split(by)
+            is_whole = rows is study
+            return [_JudgedGroup("", rows, None if is_whole else _list_episodes(rows, whole=criterion.objects is None))]
+        entry = self.slice_of(name, criterion)
+        groups = rows.split(entry)
         if criterion.by is not None:
-            groups = [self._find_group(name, criterion.by, by, study, rows, groups)]
-        every, whole = by.names(BEGAN_BY), by.of_logs and criterion.objects is None
-        return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=whole), every) for one in groups]
+            groups = [self._find_group(name, criterion.by, entry, study, rows, groups)]
+        every, is_whole = entry.names(BEGAN_BY), entry.of_logs and criterion.objects is None
+        return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=is_whole), every) for one in groups]
 
     def _choose_episodes(self, name: str, criterion: Criterion, episodes: pd.DataFrame) -> tuple[Bool, set[str]]:
         """(E,) which episodes a criterion is about, and the logs. Raises InputError where no log has such a name."""
@@ -290,27 +290,33 @@ class _JudgedStudy:
         for k, pattern in enumerate(patterns):
             if not any(fnmatchcase(log, pattern) for log in logs):
                 raise InputError(f"criteria.{name}.logs[{k}]: {unknown_name_message('log', pattern, logs)}")
-        chosen = {log for log in logs if any(fnmatchcase(log, pattern) for pattern in patterns)}
-        kept = episodes["log"].isin(chosen).to_numpy(dtype=bool)
+        log_names = {log for log in logs if any(fnmatchcase(log, pattern) for pattern in patterns)}
+        is_chosen = episodes["log"].isin(log_names).to_numpy(dtype=bool)
         if criterion.objects is not None:
             classes, ids = criterion.objects.expanded(), criterion.objects.ids or ()
             column, wanted = ("object_id", set(ids)) if classes is None else ("object_class", set(classes))
-            kept = kept & episodes[column].astype(str).isin(wanted).to_numpy(dtype=bool)
-        return kept, chosen
+            is_chosen = is_chosen & episodes[column].astype(str).isin(wanted).to_numpy(dtype=bool)
+        return is_chosen, log_names
 
     def _find_group(
-        self, name: str, asked: Mapping[str, str], by: Slice, study: StudyRows, rows: StudyRows, groups: Sequence[Group]
+        self,
+        name: str,
+        where: Mapping[str, str],
+        cut: Slice,
+        study: StudyRows,
+        rows: StudyRows,
+        groups: Sequence[Group],
     ) -> Group:
-        """The group that `by` names, without rows where the chosen rows have none of it."""
-        values = tuple(map(str, asked.values()))
+        """The group that `cut` names, without rows where the chosen rows have none of it."""
+        values = tuple(map(str, where.values()))
         if found := [one for one in groups if one.values == values]:
             return found[0]
-        for k, (key, value) in enumerate(asked.items()):
-            known = sorted({one.values[k] for one in study.split(by)})
+        for k, (key, value) in enumerate(where.items()):
+            known = sorted({one.values[k] for one in study.split(cut)})
             if value not in known and not key.startswith(("class", "began")):
                 raise InputError(f"criteria.{name}.by.{key}: {unknown_name_message('group', value, known)}")
         nothing = rows.select(np.zeros(len(rows.episodes), dtype=bool))
-        return Group(by, values, nothing)
+        return Group(cut, values, nothing)
 
     # Figures.
 
@@ -334,15 +340,15 @@ class _JudgedStudy:
         key = kind, configuration, weigh
         if key not in group.made:
             group.made[key] = self._make_figure_rows(group, kind, configuration, weigh, of_runs=criterion.of_runs)
-        made: tuple[FigureRows | None, JudgedFigure] = group.made[key]
-        rows, about = made
+        cached: tuple[FigureRows | None, JudgedFigure] = group.made[key]
+        rows, basis = cached
         if rows is None:
-            return about
+            return basis
         figure = judged.limit(rows, settings.horizon_s, criterion.confidence, criterion.bound)
-        if about.figure.kind is not None and figure.value is not None:  # it is known
-            figure = LimitedFigure(figure.value, figure.value, figure.value, about.figure.kind)
+        if basis.figure.kind is not None and figure.value is not None:  # it is known
+            figure = LimitedFigure(figure.value, figure.value, figure.value, basis.figure.kind)
         shorter = _find_shorter_horizon(criterion, rows, settings.horizon_s) if figure.bounds is not None else ""
-        return replace(about, figure=figure, shorter=shorter)
+        return replace(basis, figure=figure, shorter=shorter)
 
     def _make_figure_rows(
         self, group: _JudgedGroup, kind: str, configuration: str, weigh: str, *, of_runs: bool
@@ -365,11 +371,11 @@ class _JudgedStudy:
         clusters, why = find_judged_clusters(table, of_runs=of_runs, weigh=weigh)
         runs = float(self.results.provenance.runs)
         least = 1.0 / max(n * runs, 1.0) if exact else 1e-12
-        about = JudgedFigure(LimitedFigure(None), n=n, why=why)
+        basis = JudgedFigure(LimitedFigure(None), n=n, why=why)
         if clusters is not None:
             units = clusters.count if clusters.once else clusters.units
-            about = replace(about, over=clusters.over, clusters=clusters.count, units=units)
-        return FigureRows(table, weight, clusters, least, facts.least_s), about
+            basis = replace(basis, over=clusters.over, clusters=clusters.count, units=units)
+        return FigureRows(table, weight, clusters, least, facts.least_s), basis
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
         """By configuration the rows of a group that count."""
@@ -391,36 +397,36 @@ class _JudgedStudy:
     def _measure_sums(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
         """A metric of accuracy, or an own one, from sums by episode."""
         metric, sums = criterion.metric, group.rows.sums
-        own = {one.name: one for one in group.rows.settings.own}
+        metrics = {one.name: one for one in group.rows.settings.own}
         names = [name for name in sums if name.startswith(f"{metric} ")]
         ratio = SUMMED.get(metric)
-        over = "counted_rows" if ratio is None else ratio.over
+        denominator = "counted_rows" if ratio is None else ratio.over
         columns = names if ratio is None else [ratio.sum, ratio.over]
-        if over not in sums:
+        if denominator not in sums:
             return replace(_NO_ROW, why="accuracy is not measured")
-        sums = sums[(sums["configuration"] == configuration) & (sums[over] > 0)]
+        sums = sums[(sums["configuration"] == configuration) & (sums[denominator] > 0)]
         if not len(sums):
             return replace(_NO_ROW, why="no row has it")
 
         def of_own(totals: Float) -> float:
             given = {name.partition(" ")[2]: float(total) for name, total in zip(names, totals, strict=True)}
-            value = ask_component(own[metric], f"measure.metrics ({metric})", lambda: own[metric].value(given))
+            value = ask_component(metrics[metric], f"measure.metrics ({metric})", lambda: metrics[metric].value(given))
             return math.nan if value is None else float(value)
 
-        of = of_own if ratio is None else ratio.value_of
+        compute = of_own if ratio is None else ratio.value_of
         least = -math.inf if ratio is None else ratio.least
-        return self._limit_sums(criterion, configuration, sums, columns, of, over, least)
+        return self._limit_sums(criterion, configuration, sums, columns, compute, denominator, least)
 
     def _limit_sums(
-        self, criterion: Criterion, configuration: str, rows: pd.DataFrame, columns: Sequence[str], of: Any,
-        over: str, least: float = 0.0,
+        self, criterion: Criterion, configuration: str, rows: pd.DataFrame, columns: Sequence[str], compute: Any,
+        denominator: str, least: float = 0.0,
     ) -> JudgedFigure:  # fmt: skip
         clusters, why = None, ""
         fixed = criterion.of_runs and self.traffic.settings.facts[configuration].fixed
         if not fixed:
             clusters, why = find_judged_clusters(rows, of_runs=criterion.of_runs)
-        values, weight = rows[list(columns)].to_numpy(dtype=float), rows[over].to_numpy(dtype=float)
-        figure = limit_sums(values, of, clusters, weight, criterion.confidence, least)
+        values, weight = rows[list(columns)].to_numpy(dtype=float), rows[denominator].to_numpy(dtype=float)
+        figure = limit_sums(values, compute, clusters, weight, criterion.confidence, least)
         if fixed and figure.value is not None:
             figure = LimitedFigure(figure.value, figure.value, figure.value, NOTHING_DRAWN)
         if clusters is None:
@@ -481,17 +487,17 @@ class _JudgedStudy:
 
         The column `configuration` has names, not labels.
         """
-        alike = [
+        criteria = [
             one for one in self.criteria.values()
             if one.against is not None
             and (one.of_runs, one.confidence) == (criterion.of_runs, criterion.confidence)
             and one.weigh == criterion.weigh
         ]  # fmt: skip
-        metrics = sorted({one.metric for one in alike})
+        metrics = sorted({one.metric for one in criteria})
         folders = [self.results, *([self.before] if of_before and self.before is not None else [])]
         labelled = {(one.results, one.configuration): one.label for one in label_configurations(folders)}
         configurations = self.results.experiment.configurations
-        names = dict.fromkeys(name for one in alike for name in choose_judged(one, configurations))
+        names = dict.fromkeys(name for one in criteria for name in choose_judged(one, configurations))
         labels = {labelled[self.results, name]: name for name in names if (self.results, name) in labelled}
         baseline = labelled.get((folders[-1], other))
         if baseline is None or not (chosen := [label for label in labels if label != baseline]):
@@ -554,15 +560,15 @@ def _find_shorter_horizon(criterion: Criterion, rows: FigureRows, horizon_s: flo
 
 def _list_episodes(rows: StudyRows, *, whole: bool) -> dict[str, frozenset[tuple[str, int]] | None]:
     """By log the episodes of rows; None: the `whole` of it."""
-    kept: dict[str, frozenset[tuple[str, int]] | None] = {}
+    episodes_of: dict[str, frozenset[tuple[str, int]] | None] = {}
     for log, of_log in rows.episodes.groupby("log", sort=False):
         pairs = zip(of_log["object_id"].astype(str), of_log["episode"].astype(int), strict=True)
-        kept[str(log)] = None if whole else frozenset(pairs)
-    return kept
+        episodes_of[str(log)] = None if whole else frozenset(pairs)
+    return episodes_of
 
 
 def find_judged_clusters(table: pd.DataFrame, *, of_runs: bool, weigh: str = OBJECTS) -> tuple[Clusters | None, str]:
-    """What an interval of rows is over, or why there is none; `of_runs`: the runs, else as `choose_over` has it."""
+    """The clusters of an interval of rows, or why there are none; `of_runs`: the runs, else by `choose_over`."""
     counts = count_clusters(table)
     if of_runs:
         runs = table["run"].nunique()

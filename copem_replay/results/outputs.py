@@ -39,10 +39,10 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[Path] = (
             raise OutputError(f"{option}: expected another name, found that of an input of this command: {path}")
 
 
-def _is_same(one: Path, other: Path) -> bool:
-    if one.exists() and other.exists():
-        return os.path.samefile(one, other)
-    return os.path.realpath(one) == os.path.realpath(other)
+def _is_same(first: Path, second: Path) -> bool:
+    if first.exists() and second.exists():
+        return os.path.samefile(first, second)
+    return os.path.realpath(first) == os.path.realpath(second)
 
 
 def check_output(path: Path, is_own: IsOwn = lambda path: False) -> None:
@@ -85,11 +85,11 @@ def _find_result(path: Path) -> str | None:
     """What a path is to a results folder that it is in, if it is a file of the results or has the name of one."""
     place = Path(os.path.realpath(path.parent)) / path.name
     for folder in place.parents:
-        if (held := list_belongings(folder)) is not None:
+        if (belongings := list_belongings(folder)) is not None:
             name = place.relative_to(folder).as_posix()
             if _is_replay(name):
                 return f"that of a recording of the results in {folder.name}"
-            if name in (MARK, MADE, *(held.results or ())) or _is_table(name):
+            if name in (MARK, MADE, *(belongings.results or ())) or _is_table(name):
                 return f"that of a file of the results in {folder.name}"
     return None
 

@@ -87,7 +87,7 @@ class Provenance:
     data: dict[str, Any]
 
     def kinds(self, name: str, *, compared: bool = False) -> dict[str, str]:
-        """Kinds of the columns that a table has to have, all or only those that comparisons read."""
+        """Kinds of a table's required columns: all, or those that comparisons read."""
         needless = self.braking and self.braking.get("needless") if self.measure["accuracy"] else None
         asked = {"braking": self.braking, "conflict": self.measure["conflict"], "needless": needless}
         return TABLES[name].kinds(*(key for key, of in asked.items() if of is not None), compared=compared)
@@ -113,7 +113,7 @@ def read_provenance(path: Path) -> Provenance:
 
 
 def parse_provenance(data: Any, place: Path) -> Provenance:
-    """What `provenance.json` of the results at a place says. Raises InputError for another format."""
+    """The content of `provenance.json` of the results at a place. Raises InputError for another format."""
     if (found := dict(data).get("format", 1)) != FORMAT:
         raise InputError(f"{place}: expected results of format {FORMAT}, found format {found}; {AGAIN}")
     logs = tuple(
@@ -167,7 +167,7 @@ def _parse_tags(log: Any) -> dict[str, str]:
 
 
 def reread_recording(log: RecordedLog, place: Place, experiment: Experiment) -> Recording:
-    """A recording that results name, read again as an experiment that is resolved for it has it.
+    """A recording that results name, read again for the experiment resolved for it.
 
     Raises RecordingError, one line, where the recording is missing or not the one that was replayed.
     """

@@ -115,7 +115,7 @@ class Results:
 
     @property
     def place(self) -> Path:
-        """The folder, or what results that are not saved are called in messages."""
+        """The folder, or the name for unsaved results in messages."""
         return self.folder or self._called
 
     @property
@@ -331,12 +331,12 @@ class Results:
         if not rows.counts:
             raise InputError(f"{self.place}: nothing can be compared: no measured object has an onset")
         logs = {log.name for log in self.provenance.logs}
-        for what, unknown in (
+        for noun, unknown in (
             ("logs", set(rows.logs) - logs),
             ("configurations", set(rows.configurations) - self.facts.keys()),
         ):
             if unknown:
-                raise InputError(f"{rows.place}: expected the {what} of provenance.json, found {min(unknown)!r}")
+                raise InputError(f"{rows.place}: expected the {noun} of provenance.json, found {min(unknown)!r}")
         names = [rows.place.name, *filter(self.has, COMPARED_FILES)]
         kinds = {name: TABLES[name].kinds("braking", "fleet", "needless", compared=True) for name in names}
         return {name: (rows if name == rows.place.name else self.log_rows(name)).only(kinds[name]) for name in names}
@@ -364,12 +364,12 @@ class Results:
         """
         if self.study is not None:
             return self.study.find_log(log).whole()
-        asked = (log, resolve_for_log(experiment, log))
-        if self._read_last is None or self._read_last[0] != asked:
+        key = (log, resolve_for_log(experiment, log))
+        if self._read_last is None or self._read_last[0] != key:
             (recorded,) = (one for one in self.provenance.logs if one.name == log)
-            recording = reread_recording(recorded, self.log_place(log), asked[1])
+            recording = reread_recording(recorded, self.log_place(log), key[1])
             self._check_objects(log, recording)
-            self._read_last = asked, recording
+            self._read_last = key, recording
         return self._read_last[1]
 
     def _check_objects(self, log: str, recording: Recording) -> None:
@@ -434,13 +434,13 @@ def check_complete(results: Results, *, rowless: bool = False) -> Results:
     check_columns(rows.place, results.provenance.kinds(rows.place.name), rows.kinds)
     if rows.counts or not rowless:
         check_configurations(rows, experiment.configurations)
-    for what, expected, found in (
+    for noun, expected, actual in (
         ("logs", len(experiment.logs), len(results.provenance.logs)),
         ("configurations", len(experiment.configurations), len(experiment.configurations.keys() & results.facts)),
     ):
-        if expected != found:
+        if expected != actual:
             raise InputError(
-                f"{results.place}/{MARK}: expected {expected} {what} as in experiment.yaml, found {found}; {AGAIN}"
+                f"{results.place}/{MARK}: expected {expected} {noun} as in experiment.yaml, found {actual}; {AGAIN}"
             )
     for name in ("tally", "summary", "summary_by", "exact", "sweep"):
         getattr(results, name)

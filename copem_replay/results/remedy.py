@@ -48,7 +48,7 @@ def tell_what_helps(experiment: Experiment, rows: pd.DataFrame) -> str:
 
 
 def find_changed_keys(experiment: Experiment, last: str, other: str) -> list[str]:
-    """Keys of configurations in which two of them differ."""
+    """Keys in which two configurations differ."""
     return [key for key in _KEYS if _value_of(experiment, key, last) != _value_of(experiment, key, other)]
 
 

@@ -106,29 +106,28 @@ def tabulate_alike(
     groups: Sequence[str] = (), pad: Callable[[str, int], str] = str.rjust, more_in: str = "--explain",
     most: int = _MOST_ROWS,
 ) -> tuple[list[str], list[str]]:  # fmt: skip
-    """Configurations and their cells in columns of equal width, those with the same cells in one row, of many the
-    first; and the lines that have one of the `best`.
+    """Aligned rows of configurations and cells, one row for equal cells; and the rows with one of the `best`.
 
-    `groups`: words above each column; alike ones that are neighbours stand there once. `more_in`: where the others are.
+    `groups`: words above columns, once for neighbours with equal words. `more_in`: where omitted ones are.
     """
-    alike: dict[tuple[str, ...], list[str]] = {}
+    names_by_cells: dict[tuple[str, ...], list[str]] = {}
     for name, cells in rows:
-        alike.setdefault(tuple(cells), []).append(name)
-    shown = [*alike.items()][:most]
+        names_by_cells.setdefault(tuple(cells), []).append(name)
+    shown = [*names_by_cells.items()][:most]
     table = [("", *headers), *((name_first(names, _NAMES, _NAMES), *cells) for cells, names in shown)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    above, after = [" " * widths[0]], 1
+    header, after = [" " * widths[0]], 1
     for group, of_group in groupby(groups):
         first, after = after, after + len([*of_group])
         width = sum(widths[first:after]) + 2 * (after - first - 1)
         widths[first] += max(0, len(group) - width)
-        above.append(group.rjust(width))
+        header.append(group.rjust(width))
     padded = ([row[0].ljust(widths[0]), *map(pad, row[1:], widths[1:])] for row in table)
     head, *lines = ["  ".join(cells).rstrip() for cells in padded]
     marked = [line for line, (_, names) in zip(lines, shown, strict=True) if {*names} & {*best}]
-    left = sum(len(names) for names in [*alike.values()][most:])
-    more = [f"and {left} more: {more_in}"] if left else []
-    return [*(["  ".join(above).rstrip()] if groups else []), head, *lines, *more], marked
+    hidden = sum(len(names) for names in [*names_by_cells.values()][most:])
+    more = [f"and {hidden} more: {more_in}"] if hidden else []
+    return [*(["  ".join(header).rstrip()] if groups else []), head, *lines, *more], marked
 
 
 def _describe_rows(results: Results) -> Iterator[str]:
@@ -162,12 +161,12 @@ def _describe_left_out(results: Results) -> str:
     rows = rows[has_frame_after(rows)]
     words = set(results.provenance.measure["began"])
     parts = {"log_start": "there at the start", "appeared": "that appeared in range", "crossed": "that came into range"}
-    told = [
-        f"not {number} more {said}"
-        for word, said in parts.items()
+    phrases = [
+        f"not {number} more {phrase}"
+        for word, phrase in parts.items()
         if word not in words and (number := int((rows["began"] == word).sum()))
     ]
-    return "".join(f"; {one}" for one in told)
+    return "".join(f"; {one}" for one in phrases)
 
 
 # The screen of a comparison.
@@ -181,7 +180,7 @@ SHOWN = {
 
 
 def choose_notes(notes: Sequence[str]) -> list[str]:
-    """Notes without those that are about other figures than those of the screen, in fewer words."""
+    """The notes about figures on the screen, in fewer words."""
     notes = [re.sub("^no interval of [^:]*: ([^;]*);.*", r"no interval: \1", note) for note in notes]
     named = [{*re.findall(r"\w+", note)} & {*COMPARED} for note in notes]
     return [note for note, metrics in zip(notes, named, strict=True) if not metrics or metrics & {*SHOWN}]
@@ -194,8 +193,8 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
     least, most = {SHARE: MATTERS[SHARE]}, _MOST_CHANGES if comparison.newer else _MOST_ROWS
     same = [name for name in comparison.unchanged if name not in comparison.truths]
     folded = [f"{name_first(same, _WIDE, _WIDE - len(': unchanged'))}: unchanged"] if same else []
-    told = comparison.changed.configurations
-    if not (names := [name for name in told if name not in comparison.truths] or told):
+    changed = comparison.changed.configurations
+    if not (names := [name for name in changed if name not in comparison.truths] or changed):
         return folded, []
     if comparison.newer:  # whoever changed most comes first, so that it fits however many did
         matters = overall["metric"].map(MATTERS).astype(float)
@@ -210,15 +209,15 @@ def format_comparison(comparison: Comparison, best: Sequence[str]) -> tuple[list
     packed = _pack_columns(names, cells)
     tables = [
         tabulate_alike(
-            zip(names, zip(*(cells[metric] for metric in of), strict=True), strict=True),
-            [SHOWN[metric] for metric in of], best, pad=str.ljust, most=most,
+            zip(names, zip(*(cells[metric] for metric in metrics), strict=True), strict=True),
+            [SHOWN[metric] for metric in metrics], best, pad=str.ljust, most=most,
         )
-        for of in packed
+        for metrics in packed
     ]  # fmt: skip
     number = max(1, most // len(tables[0][0])) if tables else 0
-    shown, cells = tables[:number], {metric: cells[metric] for of in packed[:number] for metric in of}
-    if left := [SHOWN[metric].partition(", ")[0] for of in packed[number:] for metric in of]:
-        folded.insert(0, f"{' and '.join(left)}: --explain")
+    shown, cells = tables[:number], {metric: cells[metric] for metrics in packed[:number] for metric in metrics}
+    if folded_names := [SHOWN[metric].partition(", ")[0] for metrics in packed[number:] for metric in metrics]:
+        folded.insert(0, f"{' and '.join(folded_names)}: --explain")
     lines = [line for of_table, _ in shown for line in ["", *of_table]] if cells else ["", "nothing differs"]
     lines += folded
     starred = any(f" {STAR}" in line for line in lines)
@@ -262,9 +261,7 @@ def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: boo
 
 
 def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
-    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; of other metrics with a sign. `alike`: also
-    why there is no interval.
-    """
+    """`0.53 s later [0.454, 0.606] *`; `as soon` where it cannot matter; else signed. `alike`: also why no interval."""
     if row is None or pd.isna(row.difference):
         return "–"
     size, limits = float(row.difference), (row.low, row.high)
@@ -272,13 +269,13 @@ def tell_difference(metric: str, row: Any, *, alike: bool = False) -> str:
     if metric == "ttd_rmst_s":
         if max(map(abs, (size, *limits) if known else (size,))) < MATTERS[metric]:
             return "as soon"
-        told, known = tell_seconds(size, row.low, row.high), False
+        words, known = tell_seconds(size, row.low, row.high), False
     else:
         size, limits = (100 * size, (100 * row.low, 100 * row.high)) if "share" in metric else (size, limits)
-        told = (
+        words = (
             "±0"
             if abs(size) < NOTHING
             else f"{'+' if size > 0 else ''}{format_limit(size)}" + (" points" if "share" in metric else "")
         )
-    marks = [STAR] if row.star == STAR else [f"({why})" for why in explain_no_interval(row) if alike and told != "±0"]
-    return " ".join([told, *([format_limits(*limits)] if known and told != "±0" else []), *marks])
+    marks = [STAR] if row.star == STAR else [f"({why})" for why in explain_no_interval(row) if alike and words != "±0"]
+    return " ".join([words, *([format_limits(*limits)] if known and words != "±0" else []), *marks])

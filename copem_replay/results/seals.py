@@ -26,14 +26,14 @@ _OTHER_EACH_TIME = ".rrd"
 
 
 def seal_results(folder: Path, names: Iterable[str], said: Mapping[str, object]) -> dict[str, object]:
-    """What `provenance.json` says, with the seals of the named files in a folder, and of itself. Raises OSError."""
+    """The data of `provenance.json`, with the seals of the named files in a folder, and of itself. Raises OSError."""
     seals = {name: digest_file(folder / name) for name in names if name != MARK and not name.endswith(_OTHER_EACH_TIME)}
     sealed = {**said, SEALS: seals}
     return {**sealed, SEALS: seals | {MARK: _digest_said(sealed)}}
 
 
 def seal_recordings(folder: Path, names: Iterable[str]) -> list[str]:
-    """Seal those of the named files in a folder whose bytes are others each time. Returns the name of the list, if any.
+    """Seal the named files of a folder whose bytes differ in each writing. Returns the name of the list, if any.
 
     Raises OutputError, OSError.
     """
@@ -51,44 +51,44 @@ def check_recordings(files: Sequence[Path]) -> None:
                 _check_digest(file, seal, AGAIN)
 
 
-def read_seals(said: Mapping[str, Any]) -> dict[str, str]:
+def read_seals(content: Mapping[str, Any]) -> dict[str, str]:
     """The seals of files; empty in results of older versions. Raises ValueError where what is said is not sealed."""
-    if SEALS not in said:
+    if SEALS not in content:
         return {}
-    seals = dict(said[SEALS])
-    own = seals.pop(MARK, None)
-    if _digest_said({**said, SEALS: seals}) != own:
+    seals = dict(content[SEALS])
+    own_seal = seals.pop(MARK, None)
+    if _digest_said({**content, SEALS: seals}) != own_seal:
         raise ValueError("its content is not what was written (SHA-256)")
     return seals
 
 
-def check_sealed(folder: Path, name: str, seals: Mapping[str, str | None], again: str = AGAIN) -> None:
+def check_sealed(folder: Path, name: str, seals: Mapping[str, str | None], remedy: str = AGAIN) -> None:
     """Raise InputError where a file of results, or one of a table that is a folder, is not what was written.
 
-    `again`: what writes it again.
+    `remedy`: what writes it again.
     """
-    named = {one: seal for one, seal in seals.items() if seal and (one == name or one.startswith(f"{name}/"))}
+    named = {file: seal for file, seal in seals.items() if seal and (file == name or file.startswith(f"{name}/"))}
     if seals and not named and (folder / name).exists():
-        out = f"give it another name, or {again}"
+        out = f"give it another name, or {remedy}"
         raise InputError(f"{folder / name}: expected no such file among these results, found one; {out}")
-    for one, seal in named.items():
-        _check_digest(folder / one, seal, again)
+    for file, seal in named.items():
+        _check_digest(folder / file, seal, remedy)
 
 
-def _check_digest(path: Path, seal: str, again: str) -> None:
+def _check_digest(path: Path, seal: str, remedy: str) -> None:
     try:
-        found = digest_file(path)
+        digest = digest_file(path)
     except OSError as error:
-        raise InputError(f"{path}: expected a file of the results, found {error.strerror}; {again}") from None
-    if found != seal:
+        raise InputError(f"{path}: expected a file of the results, found {error.strerror}; {remedy}") from None
+    if digest != seal:
         raise InputError(
-            f"{path}: expected the file that was written, SHA-256 {seal[:12]}…, found {found[:12]}…; "
-            f"put it back, or {again}"
+            f"{path}: expected the file that was written, SHA-256 {seal[:12]}…, found {digest[:12]}…; "
+            f"put it back, or {remedy}"
         )
 
 
-def _digest_said(said: Mapping[str, object]) -> str:
-    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+def _digest_said(content: Mapping[str, object]) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 _DIGESTS: dict[tuple[int, ...], str] = {}

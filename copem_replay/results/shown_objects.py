@@ -66,7 +66,7 @@ def choose_shown_objects(scene: Scene, truth: Tracks, experiment: Experiment, ta
 
 
 def is_observed(episodes: pd.DataFrame) -> pd.Series:
-    """Whether each of some episodes, given by `onset_s` and `ended_s`, is not too short to judge."""
+    """Whether episodes, given by `onset_s` and `ended_s`, are long enough to judge."""
     return np.minimum(episodes["onset_s"], episodes["ended_s"] - episodes["onset_s"]) >= OBSERVED_S - SAME_INSTANT_S
 
 
@@ -118,19 +118,19 @@ def find_opening_s(experiment: Experiment, by_object: Sequence[pd.DataFrame]) ->
 
 
 def pick_evenly(
-    ranked: Sequence[str], most: int, kept: Sequence[str] = (), colours: Mapping[str, object] = MappingProxyType({})
+    ranked: Sequence[str], most: int, fixed: Sequence[str] = (), colours: Mapping[str, object] = MappingProxyType({})
 ) -> tuple[str, ...]:
-    """`kept`, and so many of the ranked names that they are `most`, evenly spaced, with the first and the last one.
+    """`most` of the ranked names: `fixed`, and others evenly spaced with the first and the last.
 
     Instead of one with a colour that is taken, the nearest one with another, if there is any.
     """
-    picked, last = {name: colours.get(name, name) for name in kept}, len(ranked) - 1
-    places = np.rint(np.linspace(0, last, min(most - len(picked), last + 1)))
+    taken, last = {name: colours.get(name, name) for name in fixed}, len(ranked) - 1
+    places = np.rint(np.linspace(0, last, min(most - len(taken), last + 1)))
     for place in sorted(places.tolist(), key=lambda place: min(place, last - place)):
-        left = [(colours.get(name, name), abs(k - place), name) for k, name in enumerate(ranked) if name not in picked]
-        colour, _, name = min(left, key=lambda one: (one[0] in picked.values(), one[1]))
-        picked[name] = colour
-    return (*kept, *(name for name in ranked if name in picked))
+        left = [(colours.get(name, name), abs(k - place), name) for k, name in enumerate(ranked) if name not in taken]
+        colour, _, name = min(left, key=lambda option: (option[0] in taken.values(), option[1]))
+        taken[name] = colour
+    return (*fixed, *(name for name in ranked if name in taken))
 
 
 def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episodes: pd.DataFrame) -> Float:
@@ -143,16 +143,16 @@ def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episo
         return np.zeros(len(episodes))
     first_s, last_s = (episodes[name].to_numpy(dtype=float) for name in ("onset_s", "last_s"))
     steps = np.maximum(np.ceil((last_s - first_s) / _STEP_S), 0).astype(np.int64) + 1
-    which = np.repeat(np.arange(len(steps)), steps)
-    within = np.arange(len(which)) - np.repeat(np.cumsum(steps) - steps, steps)
-    time_s = np.minimum(first_s[which] + _STEP_S * within, np.maximum(last_s, first_s)[which])
+    episode_ix = np.repeat(np.arange(len(steps)), steps)
+    within = np.arange(len(episode_ix)) - np.repeat(np.cumsum(steps) - steps, steps)
+    time_s = np.minimum(first_s[episode_ix] + _STEP_S * within, np.maximum(last_s, first_s)[episode_ix])
     numbers = episodes.index.map(scene.object_number).to_numpy(dtype=np.int64)
-    place = interpolate_places(scene, truth, experiment, numbers[which], time_s)
+    place = interpolate_places(scene, truth, experiment, numbers[episode_ix], time_s)
     nearest = np.full(len(steps), np.inf)
     for ahead_s in np.arange(0.0, PATH_S + _STEP_S / 2, _STEP_S):
-        own = interpolate_places(scene, truth, experiment, np.full(len(which), ego_ix), time_s + ahead_s)
-        distance = np.hypot(*(place - own)[:2])
-        np.minimum.at(nearest, which, np.where(np.isnan(distance), np.inf, distance))
+        ego_place = interpolate_places(scene, truth, experiment, np.full(len(episode_ix), ego_ix), time_s + ahead_s)
+        distance = np.hypot(*(place - ego_place)[:2])
+        np.minimum.at(nearest, episode_ix, np.where(np.isnan(distance), np.inf, distance))
     return nearest
 
 

@@ -90,12 +90,12 @@ SHOWN = ("detected_share", "ttd_rmst_s", "unknown_s", "dad_median_m", "pass_shar
 def groups_text(table: pd.DataFrame, width: int | None = None) -> str:
     """The rows of `summary_by.csv` for a terminal: a table for each entry, lines on it. `width`: None for a pipe."""
     parts = []
-    for by, rows in table.groupby("by", sort=False):
+    for entry, rows in table.groupby("by", sort=False):
         limits = zip(rows["detected_share_low"], rows["detected_share_high"], rows["apart"], strict=True)
         words = [_format_limits(low, high, apart is True or apart is np.True_) for low, high, apart in limits]
         names = [name for name in SHOWN if name in rows and rows[name].notna().any()]
         shown = pd.DataFrame(
-            {str(by): rows["group"], "objects": rows["objects"], "configuration": rows["configuration"]}
+            {str(entry): rows["group"], "objects": rows["objects"], "configuration": rows["configuration"]}
         )
         for name in names:
             shown[name] = rows[name].astype(float)
@@ -113,13 +113,13 @@ def _format_limits(low: float, high: float, apart: bool) -> str:
 
 
 def describe_groups(rows: pd.DataFrame) -> list[str]:
-    """What is said of groups, those with the same words together; what intervals are over."""
+    """Lines on groups, one for those with equal words; and on what intervals are over."""
     limited = rows.loc[rows["interval_over"].notna(), ["interval_over", "interval_clusters"]]
     lines = []
-    for over, of in limited.groupby("interval_over", sort=False):
-        most, fewest = (int(number) for number in of["interval_clusters"].agg(["max", "min"]))
+    for over, group in limited.groupby("interval_over", sort=False):
+        most, fewest = (int(number) for number in group["interval_clusters"].agg(["max", "min"]))
         lines.append(f"95 %: over {describe_clusters(str(over), most, fewest)}")
     lines += ["*: the interval excludes the share of all groups"] if rows["apart"].eq(True).any() else []
-    for note, of in rows.dropna(subset="note").groupby("note", sort=False):
-        lines.append(f"{', '.join(of['group'].unique())}: {note}")
+    for note, group in rows.dropna(subset="note").groupby("note", sort=False):
+        lines.append(f"{', '.join(group['group'].unique())}: {note}")
     return lines

@@ -46,7 +46,7 @@ def read_parquet(path: Path, files: Sequence[Path] = ()) -> pd.DataFrame:
 
 
 def read_frame(path: Path, reader: Callable[[Path], pd.DataFrame], kinds: Mapping[str, str]) -> pd.DataFrame:
-    """A table with at least these columns, each checked by what is known of it. Raises InputError."""
+    """A table with at least these columns, each checked against its definition. Raises InputError."""
     with _report_damage(path):
         table = reader(path)
     check_columns(path, kinds, table.columns)
@@ -75,18 +75,18 @@ def _check_series(path: Path, column: Column, values: pd.Series, *, optional: bo
     check_values(path, column, array, optional=optional)
 
 
-def check_columns(path: Path, expected: Iterable[str], found: Collection[str]) -> None:
+def check_columns(path: Path, expected: Iterable[str], present: Collection[str]) -> None:
     """Raise InputError where a column is missing, or there several times."""
-    counts = Counter(list(found))
+    counts = Counter(list(present))
     for name in expected:
         if counts[name] != 1:
             raise InputError(f"{path}: expected the column {name}, found {counts[name] or 'none'}; {AGAIN}")
 
 
-def check_kind(path: Path, name: str, kind: str, found: pa.DataType) -> None:
+def check_kind(path: Path, name: str, kind: str, data_type: pa.DataType) -> None:
     """Raise InputError where a column is of another kind."""
-    if not _is_kind(kind, found):
-        shown = "text" if _is_kind("text", found) else found
+    if not _is_kind(kind, data_type):
+        shown = "text" if _is_kind("text", data_type) else data_type
         raise InputError(f"{path}: column {name}: expected {kind}, found {shown}; {AGAIN}")
 
 
@@ -128,19 +128,19 @@ def check_values(path: Path, column: Column, values: Any, *, optional: bool = Fa
             )
 
 
-def _is_kind(kind: str, what: pa.DataType) -> bool:
+def _is_kind(kind: str, data_type: pa.DataType) -> bool:
     types = pa.types
     if kind.startswith("lists of "):
-        listed = types.is_list(what) or types.is_large_list(what)
-        return bool(listed and _is_kind(kind.removeprefix("lists of "), what.value_type))
-    if types.is_null(what):  # nothing but nulls
+        listed = types.is_list(data_type) or types.is_large_list(data_type)
+        return bool(listed and _is_kind(kind.removeprefix("lists of "), data_type.value_type))
+    if types.is_null(data_type):  # nothing but nulls
         return kind != "text"
     return bool(
         {
-            "text": types.is_string(what) or types.is_large_string(what) or types.is_dictionary(what),
-            "whole numbers": types.is_integer(what),
-            "numbers": types.is_integer(what) or types.is_floating(what),
-            "true or false": types.is_boolean(what),
+            "text": types.is_string(data_type) or types.is_large_string(data_type) or types.is_dictionary(data_type),
+            "whole numbers": types.is_integer(data_type),
+            "numbers": types.is_integer(data_type) or types.is_floating(data_type),
+            "true or false": types.is_boolean(data_type),
         }[kind.removesuffix(" or null")]
     )
 

@@ -34,7 +34,7 @@ _MARK_M, _ABOVE_M = 0.5, 0.05
 
 
 def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
-    """The truth of a run; `table`: the rows of `detections.parquet` of its log and run."""
+    """The scene of a run's truth: static and moving entities, frame to follow. `table`: the run's detections."""
     replay, replayed = replayed.replay, replace(replayed, experiment=give_views(replayed.experiment))
     static = [*_draw_obstacles(replayed), *_draw_lanes(replayed)]
     for name, unit in replayed.experiment.modelled.items():
@@ -48,7 +48,7 @@ def draw_truth(replayed: ReplayedRun, table: pd.DataFrame) -> TruthScene:
 
 
 def choose_named_objects(table: pd.DataFrame) -> list[str]:
-    """Ids of the objects that are named: those that configurations detect at the most different times."""
+    """Ids of the objects with a visible name: those whose detections differ most between configurations."""
     time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
     apart = time_s.groupby(table["object_id"], sort=False).agg(lambda times: times.max() - times.min())
     return list(apart.sort_values(ascending=False, kind="stable").index[:NAMED_OBJECTS])

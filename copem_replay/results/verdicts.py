@@ -44,7 +44,7 @@ def judge_limits(low: float, high: float, bound: float, direction: str) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a criterion in one configuration, of one `group` of a slice (empty: of all rows).
+    """The verdict on a criterion in one configuration, of one `group` of a slice (empty: of all rows).
 
     `estimate`, `low`, `high`: of the metric, None where there is none; `interval`: their kind, None: no interval.
     `over`: what it is over, and how many `clusters`. `n`: rows. `why`: in words.
@@ -72,24 +72,24 @@ class Verdict:
 
     @property
     def name(self) -> str:
-        """The criterion, and the group."""
+        """The name of the criterion, with the group."""
         return f"{self.criterion}: {self.group}" if self.group else self.criterion
 
     @property
     def asked(self) -> str:
-        """The bound: `ttd_p95_s ≤ 0.5`, `ttd_rmst_s − that of PEM ≤ 0.05`."""
+        """The bound in words: `ttd_p95_s ≤ 0.5`, `ttd_rmst_s − that of PEM ≤ 0.05`."""
         less = f" − that of {self.against}" if self.against else ""
         return f"{self.metric}{less} {SIGNS[self.direction]} {format_cell(self.bound)}"
 
     @property
     def found(self) -> str:
-        """The estimate; `never` where a quantile is among those that are never detected."""
+        """The estimate in words; `never` for a quantile among the never detected."""
         never = self.estimate is None and self.interval is not None
         return "never" if never else format_cell(self.estimate)
 
     @property
     def limits(self) -> str:
-        """`[0.5, 0.6]`; a dash on a side where there is no limit."""
+        """The interval in words: `[0.5, 0.6]`; a dash on a side without limit."""
         if self.interval is None or (self.low is None and self.high is None):
             return "–"
         low, high = (math.nan if limit is None else limit for limit in (self.low, self.high))
@@ -97,7 +97,7 @@ class Verdict:
 
     @property
     def result(self) -> str:
-        """The verdict, and whether it passes where that is not said by it."""
+        """The verdict in words, and whether it passes where that does not follow."""
         return self.verdict if self.passes == (self.verdict == MET) else f"{self.verdict}, passes"
 
 
@@ -138,7 +138,7 @@ class Judgement:
 
     @property
     def chance(self) -> str:
-        """How many verdicts may be wrong by chance, as each is judged by itself."""
+        """The number of verdicts that may be wrong by chance, as each is judged by itself."""
         levels = [verdict.confidence for verdict in self.all if verdict.over is not None and verdict.limits != "–"]
         wrong = sum((1 - level) / 2 for level in levels)
         return (
@@ -151,7 +151,7 @@ class Judgement:
 
 
 def verdicts_text(verdicts: Judgement, width: int | None = None) -> str:
-    """The verdicts for a terminal of so many characters a line; None: lines of any length."""
+    """The verdicts for a terminal of `width` characters; None: lines of any length."""
     grouped = any(verdict.group for verdict in verdicts.all)
     levels = {verdict.confidence for verdict in verdicts.all}
     limits = f"{100 * levels.pop():g} %" if len(levels) == 1 else "interval"
@@ -281,13 +281,13 @@ def read_verdicts(path: Path) -> Judgement:
         *rows, last = [parse_json(line) for line in lines]
         verdicts = Judgement(path.parent.name, tuple(_parse_verdict(k, row) for k, row in enumerate(rows, start=1)))
         total = {"verdicts": len(rows), **verdicts.count(), "passes": verdicts.passes}
-        found = dict(last["total"])
-        digest = found.pop("sha256")
+        stored = dict(last["total"])
+        digest = stored.pop("sha256")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise InputError(f"{path}: expected verdicts as they were written, found damage: {why}; {_JUDGE}") from None
-    if found != total:
-        raise InputError(f"{path}: expected a total of {total}, found {found}; {_JUDGE}")
+    if stored != total:
+        raise InputError(f"{path}: expected a total of {total}, found {stored}; {_JUDGE}")
     if digest != _digest_lines(lines[:-1]):
         raise InputError(f"{path}: expected the lines that were written, found others (SHA-256); {_JUDGE}")
     return verdicts
@@ -301,11 +301,11 @@ _KINDS: dict[str, tuple[type, ...]] = {
 
 def _parse_verdict(number: int, row: Any) -> Verdict:
     """A verdict of a line, whose word is that of its limits. Raises ValueError, KeyError, TypeError."""
-    for of in fields(Verdict):
-        value, kinds = row[of.name], [kind.strip() for kind in str(of.type).split("|")]
+    for column in fields(Verdict):
+        value, kinds = row[column.name], [kind.strip() for kind in str(column.type).split("|")]
         allowed = [one for kind in kinds for one in _KINDS.get(kind, ())]
         if not (value is None and "None" in kinds) and type(value) not in allowed:
-            raise ValueError(f"line {number}: {of.name}: expected {' or '.join(kinds)}, found {value!r}")
+            raise ValueError(f"line {number}: {column.name}: expected {' or '.join(kinds)}, found {value!r}")
     verdict = Verdict(**row)
     expected = {verdict.verdict} & {*WORDS}
     if verdict.low is not None or verdict.high is not None:

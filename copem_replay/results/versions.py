@@ -40,27 +40,27 @@ class VersionChange(NamedTuple):
 
 
 def tell_change(comparison: Comparison) -> VersionChange:
-    """What changed from older results to newer ones."""
+    """The change from older results to newer ones."""
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
     known = [name for name in comparison.configurations if name not in comparison.truths]
-    told = [name for name in known if name not in comparison.unchanged]
+    changed = [name for name in known if name not in comparison.unchanged]
     groups: dict[str, dict[str, list[str]]] = {word: {} for word in (WORSE, BETTER, _ALONE)}
-    for name in told:
+    for name in changed:
         for metric, words in _DECIDED_BY.items():
             row = rows.get((name, metric))
             if (word := _judge_row(row, comparison.matters.get(metric, MATTERS[metric]))) is not None:
                 size, *more = tell_difference(metric, row, alike=True).removesuffix(f" {STAR}").split(" ", 1)
                 groups[word].setdefault(name, []).append(" ".join([words.format(size), *more]))
     differing = tuple(dict.fromkeys(name for of in groups.values() for name in of))
-    said = [f"{word}: {name_first(_join_figures(of), 2)}" for word, of in groups.items() if of]
-    if quiet := [name for name in told if name not in differing]:
-        said.append(f"no difference is shown: {name_first(quiet, _NAMED)}")
+    sentences = [f"{word}: {name_first(_join_figures(of), 2)}" for word, of in groups.items() if of]
+    if quiet := [name for name in changed if name not in differing]:
+        sentences.append(f"no difference is shown: {name_first(quiet, _NAMED)}")
     short = " and ".join(word for word in (BETTER, WORSE) if groups[word])
-    short = short or ("no interval" if groups[_ALONE] else "no difference is shown" if told else "nothing changed")
-    same = f"{len(known) - len(told)} unchanged" if told else f"nothing changed: {name_first(known, _NAMED)}"
-    said += [same] if len(known) > len(told) else []
+    short = short or ("no interval" if groups[_ALONE] else "no difference is shown" if changed else "nothing changed")
+    same = f"{len(known) - len(changed)} unchanged" if changed else f"nothing changed: {name_first(known, _NAMED)}"
+    sentences += [same] if len(known) > len(changed) else []
     head = f"{', '.join(comparison.newer)} against {comparison.baseline}: "
-    return VersionChange(head + short, head + "; ".join(said), differing)
+    return VersionChange(head + short, head + "; ".join(sentences), differing)
 
 
 def _judge_row(row: Any, least: float) -> str | None:

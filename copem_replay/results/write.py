@@ -114,17 +114,17 @@ def _write_mcap(path: Path, run: RunToExport) -> list[str]:
     from copem_replay.io.write.message_family import find_family
 
     recording, show, table = run.recording, run.replayed.experiment.show, first_episodes(run.table)
-    with fetch_place(recording.place) as here:
-        stamps = read_file_stamps(here)
+    with fetch_place(recording.place) as local_path:
+        stamps = read_file_stamps(local_path)
         has_digest = recording.sha256 is not None or recording.stamps is not None
-        if has_digest and stamps != recording.stamps and sha256_of(here) != recording.sha256:
+        if has_digest and stamps != recording.stamps and sha256_of(local_path) != recording.sha256:
             raise RecordingError("it is no longer what was replayed", path=first_recording(recording.place))
         truth = draw_truth(run.replayed, table) if show is None or show.truth else None
         units = show is None or show.units
         chunks = ((of.fused, of.unit_lists() if units else ()) for of in run.replayed.run_tracks.chunks())
         truths = {name for name, of in run.every.items() if of.units == TRUTH}
         notes = write_mcap(
-            path, here, run.replayed.replay.scene, chunks, table, run.manifest,
+            path, local_path, run.replayed.replay.scene, chunks, table, run.manifest,
             find_family(recording), recording.window, truth,
             colours=configuration_colours(run.every, truths, shown=run.replayed.experiment.configurations),
         )  # fmt: skip
@@ -253,9 +253,9 @@ def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Seque
             write_csv(table, scratch / name)
 
 
-def _write_provenance(folder: Path, said: Mapping[str, object], files: Iterable[str]) -> None:
+def _write_provenance(folder: Path, content: Mapping[str, object], files: Iterable[str]) -> None:
     """Write `provenance.json` of a folder that is complete but for it, with the seals of its files."""
-    text = json.dumps(seal_results(folder, files, said), indent=1, ensure_ascii=False)
+    text = json.dumps(seal_results(folder, files, content), indent=1, ensure_ascii=False)
     (folder / MARK).write_text(f"{text}\n", encoding="utf-8")
 
 
@@ -302,12 +302,12 @@ def _logs_table(folder: Path, study: StudyTables, skipped: Sequence[tuple[File, 
 
 def _read_table(study: StudyTables) -> pd.DataFrame:
     """The rows of `read.csv`: what was left out or mended of each log, what changes figures first."""
-    none: dict[str, object] = {"number": 0, "what": "nothing was left out or mended", "changes": False}
+    empty_row: dict[str, object] = {"number": 0, "what": "nothing was left out or mended", "changes": False}
     rows = [
-        {"log": log.name, "topic": log.recording.topic, "frames": log.frames, "entries": log.object_states, **found}
-        | {"changes": "yes" if found["changes"] else "no"}
+        {"log": log.name, "topic": log.recording.topic, "frames": log.frames, "entries": log.object_states, **finding}
+        | {"changes": "yes" if finding["changes"] else "no"}
         for log in study.logs
-        for found in sorted(list_read(log.recording) or [none], key=lambda one: not one["changes"])
+        for finding in sorted(list_read(log.recording) or [empty_row], key=lambda one: not one["changes"])
     ]
     return TABLES["read.csv"].frame(rows)
 

@@ -131,7 +131,7 @@ class RecordingContent:
         return f"{configuration}{mark}whole run: {', '.join(counts)}" if counts else configuration
 
     def tell_false(self) -> str:
-        """The false tracks of each configuration, the longest first, in Markdown."""
+        """The false tracks of each configuration in Markdown, the longest first."""
         if self.false_tracks is None:
             return "False tracks are not known: `accuracy: false`, or configurations are compared."
         parts = [
@@ -141,19 +141,19 @@ class RecordingContent:
         return "\n\n".join(["False tracks, about nobody, of this run, the longest first", *parts])
 
     def follow(self, eye: Camera) -> MovingPicture:
-        """What a camera that moves shows, with the masts that have names: around one object, or the ego and all."""
+        """The picture of a camera that moves, with named masts: around one object, or around the ego and all."""
         stories = {k: span for k, span in self.axes_s.items() if eye.turns or k == eye.object_ix}
         masts = {k: {name for of in self.configurations for name in self.named_masts(of, [k])} for k in stories}
         return follow_episodes(self.replay, self.experiment, eye, stories, masts)
 
     def helps(self, object_ix: int) -> str:
-        """What would help with an object; “” where configurations are of several experiments: PEMs may differ, too."""
+        """The sentence on what would help with an object; “” where PEMs of several experiments may differ."""
         rows = self.episodes[object_ix]
         rows = rows[rows["configuration"].isin(list(self.configurations))]
         return tell_what_helps(self.experiment, rows) if self.of_one else ""
 
     def under(self, object_ix: int) -> list[str]:
-        """Entities of the lanes of lists under those of an object."""
+        """The entities of list lanes that stand under an object's lanes."""
         return [make_entity_path(*path) for path in select_list_lanes(self.lists, self.axes_s[object_ix])]
 
     def received(self, configuration: str) -> tuple[str, ...]:
@@ -161,9 +161,7 @@ class RecordingContent:
         return self.experiment.units_of(self.experiment.configurations[configuration])
 
     def named_masts(self, configuration: str, objects: Sequence[int]) -> list[str]:
-        """Units beside the ego's that have names among other words: those of a configuration that listed objects first,
-        the first objects first; without any the nearest ones.
-        """
+        """Named units beside the ego's: those that first listed an object in a configuration, else the nearest."""
         told = (self.episodes[k] for k in objects)
         first = [unit for rows in told for unit in rows.loc[rows["configuration"] == configuration, "first_unit"]]
         units, heard = self.experiment.units, self.received(configuration)
@@ -180,7 +178,7 @@ class RecordingContent:
 
     @property
     def selected_ns(self) -> tuple[int, int]:
-        """The time that is selected, ns since the log's start: from the first onset to the end."""
+        """The selected span of time, ns since the log's start: from the first onset to the end."""
         first_s = float(self.table["onset_s"].min()) if len(self.table) else 0.0
         first_s = first_s if self.opens_s is None or not self.baselines else self.opens_s
         scene, first_ns = self.replay.scene, int(to_nanoseconds(first_s))
@@ -228,8 +226,8 @@ def side_by_side_page(content: RecordingContent, early: str, late: str) -> rrb.C
 
 
 def choose_pair(content: RecordingContent) -> tuple[str, ...]:
-    """The configurations of the scene with two: one that knows an object where the recording opens, and one that does
-    not yet. Of several pairs the first with fewest other keys; without a difference the first two; () for fewer.
+    """Two configurations for one scene: where the recording opens, one knows an object and the other not yet. Of
+    several pairs the first with fewest other keys; without a difference the first two; () for fewer.
     """
     names, opens_s = select_perceiving(content.experiment, content.configurations), content.opens_s
     for k in content.objects:
@@ -302,12 +300,12 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
         ]
         origin = make_entity_path("plots", "visible_share", entity_names(content.replay.scene)[k])
         share = _curves_view(origin, SHARE_TITLE, content.axis(k), values=(-0.05, 1.05))
-        beside: rrb.View | rrb.Container = share
+        right_side: rrb.View | rrb.Container = share
         if content.helps(k):
             origin = make_entity_path(*helps_path(content.replay.scene, k))
             helps = rrb.TextDocumentView(origin=origin, name="What would help")
-            beside = rrb.Vertical(share, helps, row_shares=[2, 1])
-        lower_row = rrb.Horizontal(lanes_view(content, k), beside, column_shares=[3, 2])
+            right_side = rrb.Vertical(share, helps, row_shares=[2, 1])
+        lower_row = rrb.Horizontal(lanes_view(content, k), right_side, column_shares=[3, 2])
         first_s, last_s = content.axes_s[k]
         name = f"{short_ids(content.replay.scene)[k]} · {first_s:.1f}–{last_s:.1f} s"
         rows = [3, 2] if len(content.configurations) <= MANY else [1, 1]
@@ -327,12 +325,12 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
         return []
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
     between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
-    chosen = dict.fromkeys([ranked[0], *between, ranked[-1]])
+    names = dict.fromkeys([ranked[0], *between, ranked[-1]])
     titles = {
         name: f"{name}: known after {show_seconds(s)} s" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
     }
-    return [(name, titles[name]) for name in chosen]
+    return [(name, titles[name]) for name in names]
 
 
 def tracks_page(content: RecordingContent) -> rrb.Container:
@@ -355,8 +353,8 @@ def errors_page(content: RecordingContent) -> rrb.Container:
     for k in content.objects:
         kinds = {"position_error": f"{content.id_of(k)}: position error, m"}
         if content.baselines:
-            less = content.baselines[0] if len(content.baselines) == 1 else "before"
-            kinds = {"error_difference": f"{content.id_of(k)}: more error than {less}, m"} | kinds
+            baseline = content.baselines[0] if len(content.baselines) == 1 else "before"
+            kinds = {"error_difference": f"{content.id_of(k)}: more error than {baseline}, m"} | kinds
         views = [
             _curves_view(make_entity_path("plots", kind, names[k]), title, content.axis(k))
             for kind, title in kinds.items()
@@ -477,7 +475,7 @@ def world_view(
 
 
 def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] = ()) -> rrb.StateTimelineView:
-    """The lanes of one object, and the entities `under` them."""
+    """The view of one object's lanes, and of the entities `under` them."""
     import rerun.blueprint as rrb
 
     scene, onset_s = content.replay.scene, float(content.episodes[object_ix]["onset_s"].iloc[0])
@@ -490,7 +488,7 @@ def lanes_view(content: RecordingContent, object_ix: int, under: Sequence[str] =
 
 
 def difference_view(path: Sequence[str]) -> rrb.TextDocumentView:
-    """The table of times to detection at an entity."""
+    """The view of the table of times to detection at an entity."""
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(origin=make_entity_path(*path), name="What difference it made")

@@ -145,13 +145,13 @@ def write_solids(out: RecordingSink, placed: SensorPoses) -> None:
     ]
     outward = stack_float32((b - a)[:, 1], -(b - a)[:, 0], np.zeros(len(a)))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    up = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(a), 1))
+    up_normals = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(a), 1))
     walls = (4 * corner[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     fan = (corner != static.start[part]) & (next_corner != static.start[part])
     lid = 4 * len(a) + np.stack([static.start[part], corner, next_corner], axis=-1)[fan]
     mesh = rr.Mesh3D(
         vertex_positions=np.concatenate([np.stack(corners, axis=1).reshape(-1, 3), corners[3]]),
-        vertex_normals=np.concatenate([np.repeat(outward, 4, axis=0), up]),
+        vertex_normals=np.concatenate([np.repeat(outward, 4, axis=0), up_normals]),
         triangle_indices=np.concatenate([walls, lid]),
         albedo_factor=(110, 110, 110, 100),
     )
@@ -199,8 +199,8 @@ class EntriesBeside:
         self._shown = {"false": False, "second": False}
 
     def add(self, fused_tracks: FusedTracks, false: Bool) -> None:
-        """Write those of the next time chunk, `false (P,)` or not. A list without any has an empty row, if one before
-        had some.
+        """Write the entries of the next time chunk, `false (P,)` or not; an empty list gets a row if one before had
+        any.
         """
         tracks = fused_tracks.fused
         second = tracks.valid[0] & (tracks.row_object_ix < 0) & ~false
@@ -208,11 +208,11 @@ class EntriesBeside:
             if rows_of.any() or self._shown[kind]:
                 self._write(kind, tracks, rows_of, outlines)
 
-    def _write(self, kind: str, tracks: Tracks, kept: Bool, outlines: Callable[[Tracks, Int], np.ndarray]) -> None:
+    def _write(self, kind: str, tracks: Tracks, drawn: Bool, outlines: Callable[[Tracks, Int], np.ndarray]) -> None:
         import rerun as rr
 
         path, lines = ["world", configuration_part(self._name), kind], _LINES if kind == "false" else 1
-        for rows, counts, available_ns in slice_by_frame(tracks, kept):
+        for rows, counts, available_ns in slice_by_frame(tracks, drawn):
             strips = rr.LineStrips3D.columns(strips=join_points(outlines(tracks, rows)))
             self._out.columns(path, available_ns, strips.partition(counts * lines))
             if kind == "false" and self._picture is not None:
@@ -267,20 +267,20 @@ def _pack_rgba(colour: tuple[int, int, int, int]) -> int:
 
 
 def _write_boxes(
-    out: RecordingSink, path: list[str], tracks: Tracks, more: Callable[[Int], dict[str, Any]], kept: Bool | None = None
+    out: RecordingSink, path: list[str], tracks: Tracks, look: Callable[[Int], dict[str, Any]], mask: Bool | None = None
 ) -> None:
     """Write the boxes of `tracks`, each list from the instant it is available.
 
-    `more`: further columns of rows. `kept` (P,): which are drawn, None: all.
+    `look`: further columns of rows. `mask` (P,): which are drawn, None: all.
     """
     import rerun as rr
 
-    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0] if kept is None else kept):
+    for rows, counts, available_ns in slice_by_frame(tracks, tracks.valid[0] if mask is None else mask):
         columns = rr.Boxes3D.columns(
             centers=stack_float32(tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.z_m[0, rows]),
             half_sizes=stack_float32(tracks.length_m[0, rows], tracks.width_m[0, rows], tracks.height_m[0, rows]) / 2,
             rotation_axis_angles=upright_turns(tracks.yaw_rad[0, rows]),
-            **more(rows),
+            **look(rows),
         )
         out.flush()  # so that no more than two slices are held: one is sent while the next is made
         out.columns(path, available_ns, columns.partition(counts))

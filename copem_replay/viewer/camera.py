@@ -86,18 +86,18 @@ def camera_on_ego(
     units around them, the longer side across; without objects the whole site. `stories`: first and last second of each
     shown object's axis, by index, the most telling one first. `aspect`: width by height of a view.
     """
-    truth, on = replay.truth, find_followed(replay.scene, experiment)
-    if on >= 0:
+    truth, followed_ix = replay.truth, find_followed(replay.scene, experiment)
+    if followed_ix >= 0:
         onset_s = np.array([next(iter(stories.values()), (0.0, 0.0))[0]])
-        own = interpolate_places(replay.scene, replay.truth, experiment, np.array([on]), onset_s)[:, 0]
-        if np.isnan(own[0]):
-            own = _own_states(replay, on)[1][:, 0]
-        ahead = np.array([np.cos(own[3]), np.sin(own[3]), 0.0])
+        ego_state = interpolate_places(replay.scene, replay.truth, experiment, np.array([followed_ix]), onset_s)[:, 0]
+        if np.isnan(ego_state[0]):
+            ego_state = _own_states(replay, followed_ix)[1][:, 0]
+        ahead = np.array([np.cos(ego_state[3]), np.sin(ego_state[3]), 0.0])
         place = -LEAST_M / (2 * aspect * np.tan(EYE_RAD / 2)) * _look(np.pi / 2)
-        at_m = own[:3] + AHEAD_M * ahead
+        at_m = ego_state[:3] + AHEAD_M * ahead
         path = (*EYES, "ego")
-        up_rad = float(own[3]) + np.pi / 2
-        return Camera(np.round(place, 1), np.zeros(3), at_m, on, path, True, up_rad, aspect)
+        up_rad = float(ego_state[3]) + np.pi / 2
+        return Camera(np.round(place, 1), np.zeros(3), at_m, followed_ix, path, True, up_rad, aspect)
     ground_m = float(truth.z_m[0].mean()) if truth.z_m.size else 0.0
     ats = [(*unit.at[:2], ground_m) for unit in experiment.units.values() if unit.at is not None]
     units, place = np.array(ats).reshape(-1, 3).T, _story_places(replay, experiment, stories)
@@ -126,7 +126,7 @@ def _story_places(replay: Replay, experiment: Experiment, stories: Mapping[int, 
 
 @dataclass(frozen=True)
 class MovingPicture:
-    """What a camera that follows shows at the instants (K,): its middle, what is ahead in its frame, how wide it is.
+    """The picture of a camera that follows, at instants (K,): its middle, what is ahead in its frame, and its width.
 
     `scale`: how many times as wide as at least. `middle`: the picture's middle as seen from what it follows, (3, K)
     ahead, left and up. `seen`: by shown object where it is in that frame; NaN while it is absent.
@@ -141,7 +141,7 @@ class MovingPicture:
     seen: Mapping[int, Float]
 
     def frames_at(self, elapsed_ns: Int) -> Int:
-        """The newest of the instants (K,) at others (R,): what the viewer shows then; the first before it."""
+        """(R,) the newest instant (K,) at other instants (R,), as the viewer shows it; the first before it."""
         rows: Int = np.maximum(np.searchsorted(self.elapsed_ns, elapsed_ns, side="right") - 1, 0)
         return rows
 
@@ -160,41 +160,41 @@ def follow_episodes(
     replay: Replay, experiment: Experiment, eye: Camera, stories: Mapping[int, tuple[float, float]],
     masts: Mapping[int, Collection[str]] = MappingProxyType({}),
 ) -> MovingPicture:  # fmt: skip
-    """What a camera that follows shows: each object during its story, together with what it follows, the ego and units.
+    """The picture of a camera that follows: each object during its story, together with the ego and units.
 
     What hides an object is between them. Stories for which the picture would be wider than `WIDEST_M` are left out, the
     first ones last. `stories`: as in `camera_on_ego`; `masts`: by object, units in the picture with it; these and the
     ego are, if they are as near as `TOGETHER_M`.
     """
     assert eye.object_ix is not None
-    time_s, own = _own_states(replay, eye.object_ix)
-    each, still, ego_ix = np.arange(len(time_s)), np.zeros(len(time_s)), find_followed(replay.scene, experiment)
-    yaw_rad = _smooth(time_s, np.unwrap(own[3])) if eye.turns else still
+    time_s, ego_states = _own_states(replay, eye.object_ix)
+    rows, zeros, ego_ix = np.arange(len(time_s)), np.zeros(len(time_s)), find_followed(replay.scene, experiment)
+    yaw_rad = _smooth(time_s, np.unwrap(ego_states[3])) if eye.turns else zeros
     elapsed_ns = to_nanoseconds(time_s)
     elapsed_ns[:1] = 0  # before what it follows comes, the camera waits where it will
-    picture = MovingPicture(eye, elapsed_ns, own[:3], yaw_rad, still, np.zeros((3, len(time_s))), {})
+    picture = MovingPicture(eye, elapsed_ns, ego_states[:3], yaw_rad, zeros, np.zeros((3, len(time_s))), {})
 
     def locate(object_ix: int) -> Float:
         number = np.full(len(time_s), object_ix)
-        return picture.locate(interpolate_places(replay.scene, replay.truth, experiment, number, time_s)[:3], each)
+        return picture.locate(interpolate_places(replay.scene, replay.truth, experiment, number, time_s)[:3], rows)
 
-    seen = {k: locate(k) for k in stories}
-    kept = [picture.middle]
+    object_places = {k: locate(k) for k in stories}
+    held_places = [picture.middle]
     for k, (first_s, last_s) in stories.items():
-        body = _hold_ends(seen[k])
-        others = [picture.locate(locate_unit(replay, experiment, name, time_s).T, each) for name in masts.get(k, ())]
+        body = _hold_ends(object_places[k])
+        others = [picture.locate(locate_unit(replay, experiment, name, time_s).T, rows) for name in masts.get(k, ())]
         others += [locate(ego_ix)] if ego_ix >= 0 else []
         near = [np.where(np.hypot(*(at - body)[:2]) <= TOGETHER_M, at, np.nan) for at in others]
         now = (time_s >= first_s - SOON_S) & (time_s <= last_s + SOON_S)
         story = [np.where(now, at, np.nan) for at in (body, *near)]
-        fits = _fit_picture(eye, [*kept, *story])[1] * LEAST_M <= WIDEST_M
-        kept += [np.where(fits, at, np.nan) for at in story]
-    middle, scale = _fit_picture(eye, kept)
+        fits = _fit_picture(eye, [*held_places, *story])[1] * LEAST_M <= WIDEST_M
+        held_places += [np.where(fits, at, np.nan) for at in story]
+    middle, scale = _fit_picture(eye, held_places)
     if eye.turns:
-        idle = np.isnan(kept[1:]).all(axis=(0, 1)) if stories else np.ones(len(time_s), dtype=np.bool_)
+        idle = np.isnan(held_places[1:]).all(axis=(0, 1)) if stories else np.ones(len(time_s), dtype=np.bool_)
         middle[0, idle], scale[idle] = AHEAD_M, WIDE_M / LEAST_M
     middle, scale = np.stack([_smooth(time_s, axis) for axis in middle]), _smooth(time_s, scale)
-    return replace(picture, scale=scale, middle=middle, seen=seen)
+    return replace(picture, scale=scale, middle=middle, seen=object_places)
 
 
 def _hold_ends(place: Float) -> Float:
@@ -205,16 +205,16 @@ def _hold_ends(place: Float) -> Float:
 
 def _fit_picture(eye: Camera, places: Sequence[Float]) -> tuple[Float, Float]:
     """The middle (3, K) of a picture that holds places (3, K) each, and its scale (K,); NaN: nothing is held."""
-    away_m, every = float(np.linalg.norm(eye.place_m)), np.stack(places, axis=1)
+    away_m, all_places = float(np.linalg.norm(eye.place_m)), np.stack(places, axis=1)
     towards = -eye.place_m / away_m
     _, right, up = _axes(towards)
     over = np.array([up[0], up[1], 0.0]) / np.hypot(up[0], up[1])
-    middle = np.zeros((3, every.shape[2]))
+    middle = np.zeros((3, all_places.shape[2]))
     for way in (right, over):
-        along = np.tensordot(way, every, 1)
+        along = np.tensordot(way, all_places, 1)
         middle += way[:, None] * (np.nanmin(along, axis=0) + np.nanmax(along, axis=0)) / 2
-    off = ((every - middle[:, None]) / INSIDE).reshape(3, -1)
-    needed_m = np.nanmax(_fitting_distances(off, towards, eye.aspect).reshape(every.shape[1:]), axis=0)
+    off = ((all_places - middle[:, None]) / INSIDE).reshape(3, -1)
+    needed_m = np.nanmax(_fitting_distances(off, towards, eye.aspect).reshape(all_places.shape[1:]), axis=0)
     return middle, np.maximum(needed_m / away_m, 1.0)
 
 
@@ -333,28 +333,28 @@ def write_false_words(
     order = order[(np.arange(len(row)) - np.searchsorted(row, row) < NAMED_FALSE) & (distance_m[order] <= WIDEST_M)]
     spots = (place - picture.middle[:, frame])[:, order] / picture.scale[frame[order]]
     spots[1] -= BESIDE_M / picture.scale[frame[order]]
-    outside = np.abs(_project(spots, picture.eye)).max(axis=0) > 1.0
+    is_outside = np.abs(_project(spots, picture.eye)).max(axis=0) > 1.0
     labels = [
         f"false: {abs(ahead):.0f} m {'ahead' if ahead >= 0 else 'behind'}, {abs(left):.0f} m "
         f"{'left' if left >= 0 else 'right'}"
         for ahead, left in zip(ahead_m[order].tolist(), left_m[order].tolist(), strict=True)
     ]
-    spots[:, outside], sides = _move_to_edge(spots[:, outside], picture.eye, row[order][outside])
-    for k, side in zip(np.flatnonzero(outside).tolist(), sides, strict=True):
+    spots[:, is_outside], sides = _move_to_edge(spots[:, is_outside], picture.eye, row[order][is_outside])
+    for k, side in zip(np.flatnonzero(is_outside).tolist(), sides, strict=True):
         labels[k] = f"false {side} {distance_m[order[k]]:.0f} m"
-    kept = np.bincount(row[order], minlength=len(counts))
-    _write_words(out, [*picture.eye.path, "false", configuration_part(name)], elapsed_ns, spots, labels, kept, 0.0)
+    sizes = np.bincount(row[order], minlength=len(counts))
+    _write_words(out, [*picture.eye.path, "false", configuration_part(name)], elapsed_ns, spots, labels, sizes, 0.0)
 
 
 def find_up_rad(picture: MovingPicture | None, eye: Camera, elapsed_ns: Int) -> Float:
-    """(R,) the heading that is up in the picture at some instants; `picture`: of a turning camera."""
+    """(R,) the heading that is up in the picture at instants (R,); `picture`: of a turning camera."""
     if picture is None:
         return np.full(len(elapsed_ns), eye.heading_rad)
     return np.asarray(picture.yaw_rad[picture.frames_at(elapsed_ns)] + np.pi / 2)
 
 
 def below_bodies(body: Mapping[str, Float], up_rad: Float) -> Float:
-    """(3, …) the places on the ground just below bodies (…) in a picture, where words do not lie over them.
+    """(3, …) places on the ground just below bodies (…) in a picture, where words do not cover them.
 
     `up_rad`: the heading that is up in the picture.
     """
@@ -368,11 +368,11 @@ def camera_following(
     replay: Replay, experiment: Experiment, table: pd.DataFrame, object_ix: int, aspect: float
 ) -> Camera:
     """A camera that follows an object of the table, from the left of the ego's way at the onset: it runs across."""
-    scene, on = replay.scene, find_followed(replay.scene, experiment)
+    scene, followed_ix = replay.scene, find_followed(replay.scene, experiment)
     onset_s = table["onset_s"][table["object_id"] == scene.object_ids[object_ix]].to_numpy(dtype=float)[:1]
-    both = np.array([object_ix, max(on, 0)]), np.repeat(onset_s, 2)
-    target, own = interpolate_places(scene, replay.truth, experiment, *both).T
-    up_rad = (float(own[3]) if on >= 0 and not np.isnan(own[0]) else 0.0) - TURNED_RAD
+    both = np.array([object_ix, max(followed_ix, 0)]), np.repeat(onset_s, 2)
+    target, ego_place = interpolate_places(scene, replay.truth, experiment, *both).T
+    up_rad = (float(ego_place[3]) if followed_ix >= 0 and not np.isnan(ego_place[0]) else 0.0) - TURNED_RAD
     place = np.round(-CLOSE_M * _look(up_rad, DOWN_RAD), 1)
     path = (*EYES, entity_names(scene)[object_ix])
     return Camera(place, np.zeros(3), np.nan_to_num(target[:3]), object_ix, path, False, up_rad, aspect)

@@ -55,18 +55,18 @@ HATCH_S, HATCH_SIZE = 0.1, 3.5
 _LOOKS = {BY_EGO: (EGO, 2.0), BY_ANY: (TRUTH, 1.0)}
 
 
-def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curve], inside: Mapping[str, Bool]) -> None:
+def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curve], within: Mapping[str, Bool]) -> None:
     """Write the visible shares of one object; `name`: its part of entity paths.
 
-    `inside`: by curve (K,), whether the object is in a field of view of its units. A line where it is, crosses where it
+    `within`: by curve (K,), whether the object is in a field of view of its units. A line where it is, crosses where it
     is not: what could be seen of it then is not looked at.
     """
     import rerun as rr
 
     for units, curve in curves.items():
-        looked_at = np.where(inside[units], curve.share, np.nan)
+        looked_at = np.where(within[units], curve.share, np.nan)
         _write_outside(
-            out, ["plots", "visible_share", name, f"{plain_part(units)}_outside"], units, curve, inside[units]
+            out, ["plots", "visible_share", name, f"{plain_part(units)}_outside"], units, curve, within[units]
         )
         line = break_lines(curve.elapsed_ns, looked_at[:, None])
         share = np.full(len(line.counts), np.nan)
@@ -85,16 +85,16 @@ def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curv
         out.static(path, rr.SeriesLines(names=units, colors=colour, widths=width))
 
 
-def _write_outside(out: RecordingSink, path: list[str], units: str, curve: Curve, inside: Bool) -> None:
+def _write_outside(out: RecordingSink, path: list[str], units: str, curve: Curve, within: Bool) -> None:
     """Write a cross every `HATCH_S` where an object is outside all fields of view."""
     import rerun as rr
 
-    at = np.flatnonzero(~inside & ~np.isnan(curve.share))
-    if not len(at):
+    rows = np.flatnonzero(~within & ~np.isnan(curve.share))
+    if not len(rows):
         return
-    step = curve.elapsed_ns[at] // round(HATCH_S * 1e9)
-    at = at[np.append(True, step[1:] != step[:-1])]
-    out.columns(path, curve.elapsed_ns[at], rr.Scalars.columns(scalars=curve.share[at]))
+    step = curve.elapsed_ns[rows] // round(HATCH_S * 1e9)
+    rows = rows[np.append(True, step[1:] != step[:-1])]
+    out.columns(path, curve.elapsed_ns[rows], rr.Scalars.columns(scalars=curve.share[rows]))
     cross, names = rr.components.MarkerShape.Cross, f"{units}, outside the field of view"
     out.static(path, rr.SeriesPoints(colors=_LOOKS[units][0], markers=cross, marker_sizes=HATCH_SIZE, names=names))
 
@@ -168,7 +168,7 @@ def write_known_count(
 
 
 def find_false_rows(replay: Replay, experiment: Experiment, fused_tracks: FusedTracks) -> Bool:
-    """(P,) whether each entry of one run is false: about nobody, of a measured class, in the annotated area."""
+    """Mask (P,) of the false entries of one run: about no object, of a measured class, in the annotated area."""
     scene, fused, measure = replay.scene, fused_tracks.fused, experiment.measure
     false: Bool = fused.valid[0] & (fused.row_object_ix < 0)
     false &= replay.truth_cache.classes(measure)[fused_tracks.class_of(scene)]
@@ -190,12 +190,12 @@ def measure_gospa(replay: Replay, experiment: Experiment, fused_tracks: FusedTra
     settings = accuracy_settings(measure, scene.end_s)
     numbers = np.arange(len(scene.object_ids) + 1)  # the last: no object
     measured = np.isin(numbers, measured_objects(scene, measure)) & ~np.isin(numbers, replay.outside_ix)
-    ghosts, about = find_false_rows(replay, experiment, fused_tracks), fused.row_object_ix
-    about = about if fused_tracks.second_of is None else np.maximum(about, fused_tracks.second_of)
+    ghosts, owner = find_false_rows(replay, experiment, fused_tracks), fused.row_object_ix
+    owner = owner if fused_tracks.second_of is None else np.maximum(owner, fused_tracks.second_of)
     near_s, gap_s = fused.common_arrives_s, experiment.max_gap_s + AROUND_S
     near = replay.truth if not len(near_s) else replay.truth.captured_between(near_s[0] - gap_s, near_s[-1] + gap_s)
     truth = near.take_tracks(measured[near.object_ix])
-    rows, listed = sort_by_frame(fused, fused.valid[0] & (measured[about] | ghosts))
+    rows, listed = sort_by_frame(fused, fused.valid[0] & (measured[owner] | ghosts))
     elapsed, starts = elapsed_ns(fused), np.append(0, np.cumsum(listed))
     value_m = np.empty(len(listed))
     listed_m = np.stack([fused.x_m[0, rows], fused.y_m[0, rows]])
@@ -332,13 +332,13 @@ def _write_knowledge_points(
     instants = np.unique(
         np.concatenate([to_nanoseconds(tracks.common_arrives_s) for tracks in (replay.truth, first, second)])
     )
-    held, held_by_baseline = (_is_held(tracks, instants, len(scene.object_ids)) for tracks in (first, second))
+    is_held, held_by_baseline = (_is_held(tracks, instants, len(scene.object_ids)) for tracks in (first, second))
     ids = pa.array(scene.object_ids, pa.string())
-    for part, only, size, words, colour in (
-        ("gained", held & ~held_by_baseline, _GAINED_POINTS, f"not in {baseline}", pair[name]),
-        ("lost", held_by_baseline & ~held, _LOST_POINTS, f"only in {baseline}", pair[baseline]),
+    for part, is_in_one, size, words, colour in (
+        ("gained", is_held & ~held_by_baseline, _GAINED_POINTS, f"not in {baseline}", pair[name]),
+        ("lost", held_by_baseline & ~is_held, _LOST_POINTS, f"only in {baseline}", pair[baseline]),
     ):
-        row, object_ix = np.nonzero(only)
+        row, object_ix = np.nonzero(is_in_one)
         states, present = interpolate_states(
             replay.truth, object_ix, instants[row] / 1e9, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
         )

@@ -151,7 +151,7 @@ def _describe_ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
 
 
 def describe_verdict(episode: Any) -> str | None:
-    """Whether the ego stays clear by braking, in words, for a row of the detections in conflict; else None."""
+    """Whether the ego stays clear by braking, in words, for a detection in conflict; else None."""
     if not getattr(episode, "conflict", False):
         return None
     return "stays clear" if episode.braking_pass else "does not stay clear"
@@ -194,17 +194,17 @@ def write_difference_text(
 
 def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, str]) -> Iterator[str]:
     """“Shown: 6 of 49 that count. Of the others never known: object 134, 99 with late.”; nothing where all are here."""
-    names, others = (
+    names, not_shown = (
         counted["configuration"].nunique(),
         counted[~counted["object_id"].isin([scene.object_ids[k] for k in shown])],
     )
-    if not len(others):
+    if not len(not_shown):
         return
-    here = f"Shown: {len(shown)} of {len(counted) // names} that count"
-    missed = others[~others["detected"].astype(bool)].groupby("object_id", sort=False)["configuration"].unique()
+    heading = f"Shown: {len(shown)} of {len(counted) // names} that count"
+    missed = not_shown[~not_shown["detected"].astype(bool)].groupby("object_id", sort=False)["configuration"].unique()
     ids = {name: short_ids(scene)[scene.object_number[name]] for name in missed.index}
     words = [ids[name] + ("" if len(of) == names else f" with {', '.join(of)}") for name, of in missed.items()]
-    yield f"{here}." + (
+    yield f"{heading}." + (
         f" Of the others never known: object{'s' * (len(words) > 1)} {', '.join(words)}." if words else ""
     )
 
@@ -343,7 +343,7 @@ def mark_onsets(
         "onset_s",
         texts,
         ONSET[0],
-        up=-1,
+        side=-1,
     )
 
 
@@ -376,7 +376,7 @@ def mark_detections(
     except ExperimentError:  # no distances are measured
         ego = None
     _write_lasting_points(
-        out, path, replay, experiment, part, "detection_s", [""] * len(part) if ego else labels, colour, up=1
+        out, path, replay, experiment, part, "detection_s", [""] * len(part) if ego else labels, colour, side=1
     )
     if ego is not None:
         _write_reference_lines(out, [*path, "from"], replay, experiment, part, ego, labels, colour)
@@ -426,22 +426,22 @@ def _label_detection(episode: Any, name: str) -> str:
 
 
 def _write_lasting_points(
-    out: RecordingSink, path: list[str], replay: Replay, experiment: Experiment, part: pd.DataFrame, when: str,
-    texts: Sequence[str], colour: Rgb, *, up: int,
+    out: RecordingSink, path: list[str], replay: Replay, experiment: Experiment, part: pd.DataFrame, column: str,
+    texts: Sequence[str], colour: Rgb, *, side: int,
 ) -> None:  # fmt: skip
-    """Write a point per row of `part`, on the object at the instant in column `when`, from that instant on.
+    """Write a point per row of `part`, on the object at the instant in column `column`, from that instant on.
 
-    Each row of the entity holds all points up to its instant. `up`: 1 for the top of the box, −1 for the bottom.
+    Each row of the entity holds all points up to its instant. `side`: 1 for the top of the box, −1 for the bottom.
     """
     import rerun as rr
 
-    order = np.argsort(part[when].to_numpy(), kind="stable")
+    order = np.argsort(part[column].to_numpy(), kind="stable")
     object_ix = part["object_id"].map(replay.scene.object_number).to_numpy(dtype=np.int64)[order]
-    time_s = part[when].to_numpy()[order]
+    time_s = part[column].to_numpy()[order]
     states, present = interpolate_states(
         replay.truth, object_ix, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
     )  # fmt: skip
-    place = stack_float32(states["x_m"], states["y_m"], states["z_m"] + up * states["height_m"] / 2)[present]
+    place = stack_float32(states["x_m"], states["y_m"], states["z_m"] + side * states["height_m"] / 2)[present]
     words = pa.array(texts, pa.string()).take(pa.array(order[present]))
     instants, last = np.unique(to_nanoseconds(time_s[present])[::-1], return_index=True)
     counts = len(place) - last  # marks up to each instant: the index of its last one, from the end

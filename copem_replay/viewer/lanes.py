@@ -75,19 +75,19 @@ def write_lanes(
                 continue
             clock_ns = int(clocks[name].onset_ns[k]), int(clocks[name].known_ns[k])
             cut, end_ns = np.searchsorted(status.elapsed_ns, clock_ns[0]), status.elapsed_ns[-1] + STEADY_S * 1e9
-            told = status.elapsed_ns, status.status[:, m], status.unit_ix[:, m], status.frame
+            timeline = status.elapsed_ns, status.status[:, m], status.unit_ix[:, m], status.frame
             spans = [  # the onset is a border: before it words do not tell why an object is unknown
                 span
                 for rows, until_ns in ((slice(cut), min(clock_ns[0], end_ns)), (slice(cut, None), end_ns))
-                for span in list_spans(sight, m, tuple(of[rows] for of in told), names, until_ns * 1e-9, kept=KNOWN)
+                for span in list_spans(sight, m, tuple(of[rows] for of in timeline), names, until_ns * 1e-9, keep=KNOWN)
             ]
             texts = [None if span.status == ABSENT else lane_text(span) for span in spans]
             begins = to_nanoseconds([span.begin_s for span in spans])
             tints = [status_colour(span.status, colours[name]) if span.status else ONSET[0] for span in spans]
             elapsed, values, styles = _tell_lane(begins, texts, tints, name, clock_ns, axis_ns)
             path = lane_path(scene, k, place, name)
-            there = [value for value in values if value is not None]  # the row is empty while the object is absent
-            states = rr.StateChange.columns(state=pa.array(there, pa.string()))
+            present = [value for value in values if value is not None]  # the row is empty while the object is absent
+            states = rr.StateChange.columns(state=pa.array(present, pa.string()))
             out.columns(path, elapsed, states.partition(np.array([v is not None for v in values], dtype=np.int64)))
             labels, drawn = zip(*styles.values(), strict=True)
             out.static(path, rr.StateConfiguration(values=list(styles), labels=list(labels), colors=list(drawn)))
@@ -119,14 +119,14 @@ def _tell_lane(
 
 
 def lanes_axis_s(
-    axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str], beside: bool = False
+    axis_s: tuple[float, float], onset_s: float, configurations: Sequence[str], with_times: bool = False
 ) -> tuple[float, float]:
     """First and last second of an object's lanes: with room for names before the onset, and for the last flag.
 
     `axis_s`: of the object, from 0.5 s before its onset, or before it is known, to 0.5 s after it is last known.
-    `beside`: with room for times beside the names.
+    `with_times`: with room for times beside the names.
     """
-    longest = max(map(len, configurations), default=0) + beside * len(", 0.00 s, lost")
+    longest = max(map(len, configurations), default=0) + with_times * len(", 0.00 s, lost")
     name = min((_words_points(longest) + 2) / WIDTH_POINTS + MARK, MOST_NAME)
     flag = _words_points(len("10.00 s known")) / WIDTH_POINTS
     start_s = min(onset_s, axis_s[0] + BEFORE_S)
@@ -142,7 +142,7 @@ def is_briefly_known(statuses: Iterable[Status], m: int, axis_s: tuple[float, fl
     """Whether any lane of object m has a first span of known that is too short for its time on an axis."""
     least_ns = FLAG * MARK * (axis_s[1] - axis_s[0]) * 1e9
     for status in statuses:
-        for span in smooth_status(status.elapsed_ns, status.status[:, m], kept=KNOWN):
+        for span in smooth_status(status.elapsed_ns, status.status[:, m], keep=KNOWN):
             if span.status == KNOWN:
                 end = min(span.end, len(status.elapsed_ns) - 1)
                 if end == span.end and status.elapsed_ns[end] - status.elapsed_ns[span.first] < least_ns:
@@ -352,7 +352,7 @@ def write_list_fates(out: RecordingSink, name: str, lists: Sequence[UnitLists]) 
 
 
 def group_fates(unit_lists: UnitLists, fate: int) -> Iterator[list[int]]:
-    """Indices of the lists of one fate that share a row."""
+    """Indices of the lists that share a row, as one fate met them in sequence."""
     group: list[int] = []
     for k in np.flatnonzero(unit_lists.fate == fate).tolist():
         if group and k != group[-1] + 1:

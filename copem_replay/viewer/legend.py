@@ -57,13 +57,13 @@ def write_legend_bars(out: RecordingSink, colours: Mapping[str, Rgb]) -> None:
     import rerun as rr
 
     first = next(iter(colours.values()))
-    of_all = [
+    common = [
         *_MARKS,
         (_DISC, scale_colour(first, _DISC_SHARE), _BAR_POINTS),
         ("listed, not known", status_colour(EARLY, first), _BAR_POINTS),
     ]
     statuses = [(word, STATUS[status], _BAR_POINTS) for status, word in _STATUSES.items()]
-    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], of_all, statuses)
+    columns = ([(name, colour, _BAR_POINTS) for name, colour in colours.items()], common, statuses)
     rows = [(*row, c * (_WIDE + _GAP), float(k)) for c, column in enumerate(columns) for k, row in enumerate(column)]
     strips = [(strip, colour, points) for name, colour, points, x, y in rows for strip in _shape_strips(name, x, y)]
     drawn = rr.LineStrips2D(
@@ -94,7 +94,7 @@ def _shape_strips(name: str, x: float, y: float) -> list[list[list[float]]]:
 
 
 def legend_view() -> rrb.Spatial2DView:
-    """The legend."""
+    """The view of the legend."""
     import rerun.blueprint as rrb
 
     bounds = rrb.VisualBounds2D(x_range=LEGEND_X, y_range=LEGEND_Y)

@@ -32,14 +32,14 @@ def asks_for_map(experiment: Experiment) -> bool:
 
 
 def map_page(title: str = "Map") -> rrb.Container:
-    """The view, around all that is in it."""
+    """The page of the map view, around all that it shows."""
     import rerun.blueprint as rrb
 
     return rrb.Tabs(rrb.MapView(origin=MAP, name=title), name=title)
 
 
 def write_map(out: RecordingSink, replay: Replay, experiment: Experiment, frame: Frame) -> None:
-    """Write what stands as lines and points, and the centres of the truth frame by frame."""
+    """Write static things as lines and points, and the centres of the truth frame by frame."""
     import rerun as rr
 
     thin = rr.Radius.ui_points(1.0)

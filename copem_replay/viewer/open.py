@@ -53,7 +53,7 @@ def list_rrd_files(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Sought:
-    """An object that recordings open at, and its log; None: of any log."""
+    """An object that recordings open at, and its log; None: any log."""
 
     object_id: str
     log: str | None = None
@@ -282,7 +282,7 @@ addEventListener("load", async () => {
 
 @dataclass(frozen=True)
 class ViewerSite:
-    """What a server serves: files of the viewer, and paths of recordings, by their names in addresses."""
+    """The served content: files of the viewer, and paths of recordings, by their names in addresses."""
 
     assets: Mapping[str, bytes]
     recordings: Mapping[str, Path]

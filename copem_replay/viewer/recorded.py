@@ -67,15 +67,15 @@ class RecordedSensors:
 @contextmanager
 def find_recorded_sensors(recording: Recording) -> Iterator[RecordedSensors]:
     """The sensors of a recording, which may be a copy for as long. Raises RecordingError where it cannot be read."""
-    with fetch_place(recording.place) as here:
-        log = open_log(here).within(recording.window)
-        places = zip(here.paths, here.ahead_ns, strict=True) if isinstance(here, DriveRecordings) else [(here, 0)]
+    with fetch_place(recording.place) as local:
+        log = open_log(local).within(recording.window)
+        places = zip(local.paths, local.ahead_ns, strict=True) if isinstance(local, DriveRecordings) else [(local, 0)]
         files = {file: ns for at, ns in places for file in (list_bag_files(at) if at.is_dir() else [at])}
         images, points, calibrations = (
             tuple(dict.fromkeys(c.topic for c in log.channels if c.messages and c.schema in of))
             for of in (IMAGES, POINTS, CALIBRATIONS)
         )
-        around = recording.around or log.attempt(lambda log: read_log_context(log, None, seek_ego=False))
+        context = recording.around or log.attempt(lambda log: read_log_context(log, None, seek_ego=False))
         truth = frozenset(c.number for c in log.channels if c.topic == recording.topic)
         apart_ns = recording.scene.t0_ns - log.attempt(lambda log: next(iter(log.payloads(truth))))[1]
         named = {topic: row.column(_FRAME)[0].as_py()[0] for topic, row in _find_first(files, images + points, _FRAME)}
@@ -86,23 +86,23 @@ def find_recorded_sensors(recording: Recording) -> Iterator[RecordedSensors]:
             topic: frame.lstrip("/")
             for topic, frame in named.items()
             if topic in points or topic in pinholes
-            if (poses := _place(recording, around.frames, frame.lstrip("/"), recording.truth.stamp_ns)) is not None
+            if (poses := _place(recording, context.frames, frame.lstrip("/"), recording.truth.stamp_ns)) is not None
             if poses.there.any()
         }
-        others = [
+        undrawn = [
             f"{c.topic} ({c.schema or c.encoding})"
             for c in log.channels
             if c.messages and c.topic not in (*images, *points, *calibrations, recording.topic)
             if not (is_list(c) or is_pose(c) or c.schema.startswith("osi3."))
         ]
-        bare = [topic for topic in images + points if topic not in frames]
+        unplaced = [topic for topic in images + points if topic not in frames]
         notes = [
-            _tell("Rerun's reader of MCAP does not draw", others),
-            _tell("no boxes on, for want of a calibration or of transforms", bare),
+            _tell("Rerun's reader of MCAP does not draw", undrawn),
+            _tell("no boxes on, for want of a calibration or of transforms", unplaced),
             "" if images + points else "it has no images and no points that Rerun's reader of MCAP draws",
         ]
         yield RecordedSensors(
-            recording, files, around.frames, apart_ns if abs(apart_ns) > SLACK_NS else 0, images, points, frames,
+            recording, files, context.frames, apart_ns if abs(apart_ns) > SLACK_NS else 0, images, points, frames,
             pinholes, tuple(filter(None, notes)),
         )  # fmt: skip
 
@@ -156,7 +156,7 @@ def write_recorded(out: RecordingSink, sensors: RecordedSensors) -> list[str]:
     """Write images and points, calibrations, and poses of sensors. Returns notes: what is not shown, and why."""
     import rerun as rr
 
-    scene, topics, seen = sensors.recording.scene, (*sensors.images, *sensors.points), set[str]()
+    scene, topics, drawn_topics = sensors.recording.scene, (*sensors.images, *sensors.points), set[str]()
     for topic, rows in sensors.pinholes.items():
         _send(out, topic, rows, None)
     for path, ahead_ns in sensors.files.items():
@@ -165,15 +165,15 @@ def write_recorded(out: RecordingSink, sensors: RecordedSensors) -> list[str]:
         for topic, rows in _read(path, topics, *span_ns):
             stamp_ns = _find_stamps(rows, shift_ns, ahead_ns)
             _send(out, topic, rows, stamp_ns - scene.t0_ns)
-            seen.add(topic)
+            drawn_topics.add(topic)
             if topic in sensors.frames and _FRAME in rows.schema.names:
                 poses = _place(sensors.recording, sensors.tree, sensors.frames[topic], stamp_ns)
                 assert poses is not None
-                at_m, turned = poses.position_m[poses.there], poses.rotation[poses.there]
-                columns = rr.Transform3D.columns(translation=at_m, quaternion=turned)
+                at_m, rotation = poses.position_m[poses.there], poses.rotation[poses.there]
+                columns = rr.Transform3D.columns(translation=at_m, quaternion=rotation)
                 out.columns([RECORDED, *_parts(topic)], stamp_ns[poses.there] - scene.t0_ns, columns)
             out.flush()
-    missed = [topic for topic in topics if topic not in seen]
+    missed = [topic for topic in topics if topic not in drawn_topics]
     return [*sensors.notes, *filter(None, [_tell("Rerun's reader finds no message while the truth lasts on", missed)])]
 
 

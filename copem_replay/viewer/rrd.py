@@ -126,8 +126,8 @@ def write_rrd(
     first = next(later_chunks)
     truths = [name for name, asked in experiment.configurations.items() if asked.units == TRUTH]
     # The truth is in every view, so it needs none of its own; configurations that are compared were chosen.
-    beside = [name for name in first if name not in truths] if not baselines else []
-    parts = split_into_files(beside or list(first), baselines)
+    viewed = [name for name in first if name not in truths] if not baselines else []
+    parts = split_into_files(viewed or list(first), baselines)
     shown = choose_shown_objects(replay.scene, replay.truth, experiment, table)
     objects = list(shown.object_ix)
     collector = TrackCollector(objects)
@@ -143,8 +143,8 @@ def write_rrd(
             # The viewer takes two files of one identity for one recording.
             ids = f"copem_replay:{digest_layout(content)}", digest_texts(*identity)
             out = stack.enter_context(_open_streams(part.path(path), ids, replay.scene.t0_ns, viewer))
-            every = experiment.configurations
-            by_name = colours or configuration_colours(every, truths, shown=part.configurations)
+            all_configurations = experiment.configurations
+            by_name = colours or configuration_colours(all_configurations, truths, shown=part.configurations)
             files.append(_RecordingFile(out, content, {name: by_name[name] for name in part.configurations}))
             _begin_file(files[-1], summary, run, run_is, [p.path(path).name for p in parts if p != part])
         if baselines:  # of all objects at once: such a log is not long
@@ -187,7 +187,7 @@ class _RecordingFile:
 
     @cached_property
     def picture(self) -> MovingPicture | None:
-        """What the camera on the ego shows; None: it stands still."""
+        """The picture of the camera on the ego; None: it stands still."""
         return self.content.follow(self.content.eye) if self.content.eye.turns else None
 
 
@@ -261,8 +261,8 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
     out.static(["false"], rr.TextDocument(content.tell_false(), media_type=rr.MediaType.MARKDOWN))
     write_legend_text(out, any(content.lists.values()))
     write_legend_bars(out, file.colours)
-    chosen = content.table[content.table["object_id"].isin([scene.object_ids[k] for k in content.objects])]
-    write_onset_texts(out, scene, chosen)
+    shown_rows = content.table[content.table["object_id"].isin([scene.object_ids[k] for k in content.objects])]
+    write_onset_texts(out, scene, shown_rows)
     boxes.write_grid(out, replay.truth)
     boxes.write_solids(out, replay.placed)
     boxes.write_lane_boundaries(out, replay.lane_boundaries)
@@ -275,7 +275,7 @@ def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: s
         if (
             experiment.configurations[name].units != TRUTH or len(file.colours) == 1
         ):  # what is known at once is no event
-            write_event_texts(out, scene, name, chosen[chosen["configuration"] == name])
+            write_event_texts(out, scene, name, shown_rows[shown_rows["configuration"] == name])
         mark_detections(out, replay, experiment, content.table, name, content.objects, colour)
         write_list_fates(out, name, content.lists[name])
     if len(replay.episodes.object_ix):
@@ -434,14 +434,14 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
 
 
 def write_with_recording(scratch: Path, results: Results, file: Path) -> tuple[Path, list[str]]:
-    """Write the run that results show of a recording again, with its images and points, into a scratch folder.
+    """Write the run shown in results again, with the recording's images and points, into a scratch folder.
 
     Returns the path, there as in the folder of results, and notes. Raises InputError where it is none of these results.
     """
-    digest, every = sha256_of(file), results.provenance.logs
-    logs = [log.name for log in every if log.sha256 == digest or file in list_recordings(results.log_place(log.name))]
+    digest, study = sha256_of(file), results.provenance.logs
+    logs = [log.name for log in study if log.sha256 == digest or file in list_recordings(results.log_place(log.name))]
     if not logs:
-        known = ", ".join(f"{log.name} (SHA-256 {log.sha256[:12]}…)" for log in every[:MOST_LISTED])
+        known = ", ".join(f"{log.name} (SHA-256 {log.sha256[:12]}…)" for log in study[:MOST_LISTED])
         raise InputError(f"{file}: expected a recording of {results.place}: {known}; found SHA-256 {digest[:12]}…")
     log, experiment = logs[0], resolve_for_log(results.experiment, logs[0])
     (first, *_) = results.provenance.data["runs_shown"].get(log) or [{"run": 0}]
@@ -457,7 +457,7 @@ def write_with_recording(scratch: Path, results: Results, file: Path) -> tuple[P
     summary, recording = results.summary, results.recording(log, results.experiment)
     summary = summary[summary["configuration"].isin(list(shown))]
     exported = RunToExport(recording, shown_run, replayed, experiment.configurations, table, summary, {}, *events)
-    path = scratch / (f"{STEM}.rrd" if len(every) == 1 else f"{STEM}/{portable_name(log)}.rrd")
+    path = scratch / (f"{STEM}.rrd" if len(study) == 1 else f"{STEM}/{portable_name(log)}.rrd")
     path.parent.mkdir(exist_ok=True)
     return path, make_rrd_exporter(None).write(path, exported)
 
@@ -517,12 +517,12 @@ class TrackCollector:
         received = fused_tracks.received
         of_objects, key = self._is_of_objects(received), self._key(received)
         before = np.concatenate([np.empty(0, dtype=np.int64), *pieces.keys])
-        fresh = np.flatnonzero(of_objects & ~np.isin(key, before))
-        rows = received.take_rows(fresh)  # every time chunk has the lists of the whole log: they are kept once
+        new_rows = np.flatnonzero(of_objects & ~np.isin(key, before))
+        rows = received.take_rows(new_rows)  # every time chunk has the lists of the whole log: they are kept once
         pieces.received.append(rows.in_lists_of(pieces.received[0] if pieces.received else rows))
-        pieces.keys.append(key[fresh])
+        pieces.keys.append(key[new_rows])
         if fused_tracks.left_out is not None:
-            pieces.left_out.append(fused_tracks.left_out[fresh])
+            pieces.left_out.append(fused_tracks.left_out[new_rows])
 
     def _is_of_objects(self, tracks: Tracks) -> Bool:
         """(P,) whether each row is about one of the objects."""

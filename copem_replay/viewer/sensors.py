@@ -81,15 +81,15 @@ def choose_named_units(replay: Replay, experiment: Experiment, at_m: Float, time
 
     A recorded unit has a name if the experiment says where it is.
     """
-    every = {name: locate_unit(replay, experiment, name, np.array([time_s]))[0] for name in experiment.units}
-    place = {name: at for name, at in every.items() if not np.isnan(at[0])}
+    all_places = {name: locate_unit(replay, experiment, name, np.array([time_s]))[0] for name in experiment.units}
+    place = {name: at for name, at in all_places.items() if not np.isnan(at[0])}
     order = sorted(place, key=lambda name: (experiment.units[name].on != "ego", np.hypot(*(place[name] - at_m)[:2])))
-    chosen: dict[str, Float] = {}
+    named: dict[str, Float] = {}
     for name in order:
-        apart = (np.hypot(*(place[name] - other)[:2]) >= APART_M for other in chosen.values())
-        if len(chosen) < NAMED_UNITS and np.hypot(*(place[name] - at_m)[:2]) <= NAMED_WITHIN_M and all(apart):
-            chosen[name] = place[name]
-    return chosen
+        apart = (np.hypot(*(place[name] - other)[:2]) >= APART_M for other in named.values())
+        if len(named) < NAMED_UNITS and np.hypot(*(place[name] - at_m)[:2]) <= NAMED_WITHIN_M and all(apart):
+            named[name] = place[name]
+    return named
 
 
 def locate_unit(replay: Replay, experiment: Experiment, name: str, time_s: Float) -> Float:
@@ -208,7 +208,7 @@ class FaultsShown:
         self._shown_until_ns: dict[str, int] = {}
 
     def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
-        """Write those of the next time chunk; `run_tracks`: fused tracks by configuration."""
+        """Write the faults of the next time chunk; `run_tracks`: fused tracks by configuration."""
         candidates = [fused_tracks for fused_tracks in run_tracks.values() if fused_tracks.faults is not None]
         if not candidates:
             return

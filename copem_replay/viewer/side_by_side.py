@@ -149,14 +149,14 @@ def write_side_by_side(
     pairs = pair_configurations(all_results, configurations, baseline)
     if configurations is None:  # the truth is in every view: beside others it is left out
         pairs = {one: other for one, other in pairs.items() if not one.facts.truth} or pairs
-    chosen = list(dict.fromkeys(choice for pair in pairs.items() for choice in reversed(pair)))  # baselines first
-    labels = [choice.label for choice in chosen]
+    named = list(dict.fromkeys(choice for pair in pairs.items() for choice in reversed(pair)))  # baselines first
+    labels = [choice.label for choice in named]
     baselines = {one.label: other.label for one, other in pairs.items()}
     versions = baseline is None and len(all_results) == 2
-    _check_one_recording(list(dict.fromkeys(choice.results for choice in chosen)))
-    used = [check_complete(results) for results in dict.fromkeys(choice.results for choice in chosen)]
-    log, shown_run = _choose_run(used[0], used, log, run)
-    sides = _replay_sides(used, chosen, log, shown_run)
+    _check_one_recording(list(dict.fromkeys(choice.results for choice in named)))
+    opened = [check_complete(results) for results in dict.fromkeys(choice.results for choice in named)]
+    log, shown_run = _choose_run(opened[0], opened, log, run)
+    sides = _replay_sides(opened, named, log, shown_run)
     experiment = _join_sides(sides, labels)
     recording = _reread_truth(sides, log, experiment)
     run_tracks = {side.labels[name]: fused for side in sides for name, fused in side.one.run_tracks.whole().items()}
@@ -177,9 +177,9 @@ def write_side_by_side(
         shown_run,
         run_is=f"differences to {name_folders(all_results)[0] if versions else labels[0]}",
         baselines=baselines,
-        of_one=len(used) == 1,
+        of_one=len(opened) == 1,
         false_tracks=_join_false_tracks(sides, log, shown_run),
-        colours=_colour_versions(chosen, list(pairs.values())) if versions else None,
+        colours=_colour_versions(named, list(pairs.values())) if versions else None,
     )
     return [f"{path}: {line}" for line in _note_other_worlds(sides)]
 
@@ -187,23 +187,23 @@ def write_side_by_side(
 def _colour_versions(chosen: Sequence[LabelledConfiguration], older: Sequence[LabelledConfiguration]) -> dict[str, Rgb]:
     """Colours by label: those that configurations have in all files of their experiment; of the older ones paler."""
     colours: dict[str, Rgb] = {}
-    for one in chosen:
-        truths = [name for name, facts in one.results.facts.items() if facts.truth]
-        own = configuration_colours(one.results.experiment.configurations, truths)
-        red, green, blue = ((a + b) // 2 for a, b in zip(own[one.configuration], TRUTH, strict=True))
-        colours[one.label] = (red, green, blue) if one in older else own[one.configuration]
+    for labelled in chosen:
+        truths = [name for name, facts in labelled.results.facts.items() if facts.truth]
+        colours_of = configuration_colours(labelled.results.experiment.configurations, truths)
+        red, green, blue = ((a + b) // 2 for a, b in zip(colours_of[labelled.configuration], TRUTH, strict=True))
+        colours[labelled.label] = (red, green, blue) if labelled in older else colours_of[labelled.configuration]
     return colours
 
 
-def _replay_sides(used: Sequence[Results], chosen: Sequence[LabelledConfiguration], log: str, run: int) -> list[_Side]:
+def _replay_sides(opened: Sequence[Results], named: Sequence[LabelledConfiguration], log: str, run: int) -> list[_Side]:
     """The run of every folder. Raises InputError for a configuration without units in the log."""
-    for choice in chosen:
+    for choice in named:
         if choice.configuration not in resolve_for_log(choice.results.experiment, log).configurations:
             raise InputError(
                 f"configuration {choice.label}: log {log} has none of its units; choose another log with --log"
             )
     return [
-        _replay_side(results, [choice for choice in chosen if choice.results is results], log, run) for results in used
+        _replay_side(results, [choice for choice in named if choice.results is results], log, run) for results in opened
     ]
 
 
@@ -240,13 +240,13 @@ def _list_configurations(all_results: Sequence[Results], experiment: Experiment)
     return configurations
 
 
-def _check_one_recording(used: Sequence[Results]) -> None:
+def _check_one_recording(opened: Sequence[Results]) -> None:
     """Raise InputError if folders are of different recordings of a drive: a picture holds the truth of one."""
-    expected = {(log.name, log.sha256) for log in used[0].provenance.logs}
-    for results in used[1:]:
+    expected = {(log.name, log.sha256) for log in opened[0].provenance.logs}
+    for results in opened[1:]:
         for log in results.provenance.logs:
             if (log.name, log.sha256) not in expected:
-                first_folder = used[0].place
+                first_folder = opened[0].place
                 raise InputError(
                     f"{results.place}: log {log.name}: expected the recording of {first_folder}, found another "
                     "of the same drive: they cannot be shown together; compare them without --rrd"

@@ -125,17 +125,17 @@ def file_stream(path: Path, application_id: str, recording_id: str) -> Iterator[
     import rerun as rr
 
     with atomic_file(path) as scratch:
-        out, into = os.pipe()
-        pump = _Pump(out, scratch)
+        read_fd, write_fd = os.pipe()
+        pump = _Pump(read_fd, scratch)
         rec = rr.RecordingStream(application_id, recording_id=recording_id, send_properties=False)
         try:
             if not rr.is_enabled(rec):
                 raise OutputError(f"{path}: not written, Rerun is switched off (RERUN=off in the environment?)")
-            rec.save(f"/dev/fd/{into}")
+            rec.save(f"/dev/fd/{write_fd}")
             yield rec
         finally:
             rec.disconnect()  # writes the end of the file
-            os.close(into)
+            os.close(write_fd)
             pump.join()
         if pump.error is not None:
             raise pump.error
@@ -235,11 +235,11 @@ class RecordingSink:
         """Wait until all that was sent has left this process, so that little of it is held in memory."""
         self.rec.flush()
 
-    def static(self, path: Sequence[str], *what: Any) -> None:
+    def static(self, path: Sequence[str], *components: Any) -> None:
         """Write components that hold at all times."""
         import rerun as rr
 
-        self.send(lambda rec: rec.log(rr.new_entity_path(list(path)), *what, static=True))
+        self.send(lambda rec: rec.log(rr.new_entity_path(list(path)), *components, static=True))
 
     def columns(self, path: Sequence[str], elapsed_ns: Int, columns: Any) -> None:
         """Write columns with a row per instant (F,), ns since the log's start."""
@@ -282,7 +282,7 @@ def _name_entities(ids: tuple[str, ...], classes: tuple[int, ...]) -> tuple[str,
 
 
 def make_distinct(names: Sequence[str]) -> list[str]:
-    """The names, with their index after those that occur more than once."""
+    """The names, those that occur more than once with their index."""
     twice = {name for name, count in Counter(names).items() if count > 1}
     return [f"{name}_{k}" if name in twice else name for k, name in enumerate(names)]
 
@@ -333,16 +333,16 @@ def object_labels(scene: Scene) -> pa.Array:
     return pa.array(names, pa.string())
 
 
-def sort_by_frame(tracks: Tracks, kept: Bool) -> tuple[Int, Int]:
-    """The rows (P,) with `kept`, list by list, and their number per list (F,)."""
+def sort_by_frame(tracks: Tracks, drawn: Bool) -> tuple[Int, Int]:
+    """The rows (P,) with `drawn`, list by list, and their number per list (F,)."""
     order, _ = tracks.by_frame
-    rows = order[kept[order]]
+    rows = order[drawn[order]]
     return rows, np.bincount(tracks.frame_ix[rows], minlength=len(tracks.stamp_ns))
 
 
-def slice_by_frame(tracks: Tracks, kept: Bool) -> Iterator[tuple[Int, Int, Int]]:
+def slice_by_frame(tracks: Tracks, drawn: Bool) -> Iterator[tuple[Int, Int, Int]]:
     """`sort_by_frame` in pieces of whole lists, of about `SLICE_ROWS` rows; with the instants of each piece (ns)."""
-    rows, counts = sort_by_frame(tracks, kept)
+    rows, counts = sort_by_frame(tracks, drawn)
     ends = np.cumsum(counts)
     available_ns = elapsed_ns(tracks)
     frame = row = 0
@@ -381,21 +381,21 @@ VIEWED = 7
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """The configurations of one file, and what its name has before the suffix."""
+    """The configurations of one file, and the infix of its name before the suffix."""
 
     configurations: tuple[str, ...]
     infix: str = ""
 
     def path(self, path: Path) -> Path:
-        """The path of this file; `path`: that of the first file."""
+        """The path of this part's file, derived from `path`, that of the first file."""
         return path.with_name(f"{path.stem}{self.infix}{path.suffix}")
 
 
 def split_into_files(configurations: Sequence[str], baselines: Mapping[str, str] | None = None) -> list[RecordingPart]:
     """All configurations in their order, seven per file: `replay.rrd`, `replay.configurations_8-14.rrd` and so on.
 
-    The baseline of all is in every file, and the first of it. Of several baselines each stands before what is held
-    against it, and is in the same file.
+    The baseline of all is the first in every file. Of several baselines each stands in the file of the configurations
+    that are compared with it, before them.
     """
     against = {*(baselines or {}).values()}
     shared = tuple(name for name in configurations if name in against) if len(against) == 1 else ()

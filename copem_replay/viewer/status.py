@@ -50,7 +50,7 @@ OLD_S = 0.05
 
 @dataclass(frozen=True)
 class Reasons:
-    """Label over an object and sentence on its selection, for pairs (P,) of instant and object.
+    """The label over an object and the sentence on its selection, for pairs (P,) of instant and object.
 
     `number`: equal for equal sentences.
     """
@@ -77,16 +77,16 @@ def explain_status(
         np.where(status >= EARLY, statuses.age_of_information_s[rows, column], statuses.until_s[rows, column])
     )
     near = sight.in_range[:, frame, column].any(axis=0)
-    whole = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
-    columns = np.stack([column, status, unit, *whole, body, near], axis=-1)
-    keys, which = _find_distinct_rows(columns)
+    rounded = [np.rint(value).astype(np.int64) for value in (time_s * 10, share * 100)]
+    columns = np.stack([column, status, unit, *rounded, body, near], axis=-1)
+    keys, key_ix = _find_distinct_rows(columns)
     ids, units = short_ids(scene), [*experiment.units, TRUTH]  # index −1: the truth, or no unit
     bodies = name_bodies(scene, sight.solids, ids)
     details = [(ids[sight.object_ix[key[0]]], units[key[2]], bodies[key[5]], key) for key in keys.tolist()]
-    picked = pa.array(which)
+    take_ix = pa.array(key_ix)
     labels = [_format_label(name, unit, hider, key) for name, unit, hider, key in details]
     sentences = [_format_sentence(name, unit, hider, key) for name, unit, hider, key in details]
-    return Reasons(pa.array(labels, pa.string()).take(picked), pa.array(sentences, pa.string()).take(picked), which)
+    return Reasons(pa.array(labels, pa.string()).take(take_ix), pa.array(sentences, pa.string()).take(take_ix), key_ix)
 
 
 def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
@@ -257,12 +257,12 @@ def write_listing_lines(
 def _is_of_first_unit(lists: Tracks, rows: Int, column: Int, sight: Sight, first_unit: Mapping[int, str]) -> Bool:
     """(P,) whether each row is of the unit that listed its object first."""
     unit = lists.frame_unit_ix[lists.frame_ix[rows]]
-    kept = np.zeros(len(rows), dtype=bool)
+    is_first = np.zeros(len(rows), dtype=bool)
     for m, k in enumerate(sight.object_ix.tolist()):
         object_rows = np.flatnonzero(column == m)
         if not len(object_rows):
             continue
         name = first_unit.get(k)
         soonest = object_rows[np.argmin(lists.common_arrives_s[lists.frame_ix[rows[object_rows]]])]
-        kept[object_rows] = unit[object_rows] == (lists.units.index(name) if name in lists.units else unit[soonest])
-    return kept
+        is_first[object_rows] = unit[object_rows] == (lists.units.index(name) if name in lists.units else unit[soonest])
+    return is_first

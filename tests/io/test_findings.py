@@ -309,7 +309,7 @@ def read(path: Path, how: dict[str, Any]) -> tuple[bytes, tuple[str, ...]]:
         notes, tracks = recording.notes, [recording.truth]
         if unit is not None:
             lists, of_lists = read_recorded_unit(
-                recording, unit, RecordedTopic(topic=unit, covariance_m2=((1, 0), (0, 1))), held=False
+                recording, unit, RecordedTopic(topic=unit, covariance_m2=((1, 0), (0, 1))), checked=False
             )
             notes, tracks = (*notes, *of_lists), [*tracks, lists.tracks]
             said = [lists.existence, lists.class_probability, lists.spread_said]

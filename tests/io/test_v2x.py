@@ -227,7 +227,7 @@ def seen(t_s: float, late_s: float = 0.02, *, clock_s: float = 0.0, **changes: A
 
 
 def lists_of(path: Path, frame: Frame | None = HERE) -> RecordedLists:
-    recording = read_log(path, name="log", beside=["cpm"])
+    recording = read_log(path, name="log", unit_topics=["cpm"])
     return read_unit_lists(path, "cpm", replace(recording.scene, frame=frame), recording.around)
 
 

@@ -399,7 +399,7 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
     """Tenths of a second each status lasts: spans are long, or the first of all, or the first known."""
     lasts, what = np.array([r for r, _ in runs]), np.array([s for _, s in runs])
     elapsed = np.append(0, np.cumsum(lasts)[:-1]) * 100_000_000
-    spans = smooth_status(elapsed, what, kept=KNOWN)
+    spans = smooth_status(elapsed, what, keep=KNOWN)
     assert spans[0].first == 0
     assert spans[-1].end == len(what)
     assert all(a.end == b.first and a.status != b.status for a, b in pairwise(spans))
@@ -416,7 +416,7 @@ def test_steady_lanes_begin_known_where_it_begins(runs: list[tuple[int, int]]) -
 
 def test_what_is_short_after_an_absence_is_no_absence() -> None:
     """Absent for 1 s, hidden for 0.3 s, known from then on."""
-    spans = smooth_status(np.array([0, 10, 13]) * 100_000_000, np.array([ABSENT, HIDDEN, KNOWN]), kept=KNOWN)
+    spans = smooth_status(np.array([0, 10, 13]) * 100_000_000, np.array([ABSENT, HIDDEN, KNOWN]), keep=KNOWN)
     assert [(span.first, span.status) for span in spans] == [(0, ABSENT), (1, HIDDEN), (2, KNOWN)]
 
 

@@ -93,35 +93,35 @@ def _guess_stamp(offers: Collection[str], stamped: Mapping[str, Sequence[str]], 
             if words and re.match(r"\d{4}-\d\d-\d\d[T ]", words[0]):
                 return path
             try:
-                apart = {
+                offset_ns = {
                     unit: max(abs(float(w) * scale - t) for w, t in zip(words, log_time_ns, strict=False))
                     for unit, scale in UNIT_NS.items()
                 }
             except ValueError:  # no number, or no message
                 continue
-            unit = min(apart, key=lambda name: apart[name])
-            if apart[unit] < _DAY_NS:
+            unit = min(offset_ns, key=lambda name: offset_ns[name])
+            if offset_ns[unit] < _DAY_NS:
                 return path if unit == "s" else {"path": path, "unit": unit}
     return None
 
 
-def _guess_object_fields(inside: Mapping[str, str]) -> Iterator[tuple[str, list[Any]]]:
+def _guess_object_fields(kind_of: Mapping[str, str]) -> Iterator[tuple[str, list[Any]]]:
     """By key the fields that an object may have for it, the likeliest first."""
-    plain = {path: what for path, what in inside.items() if "[]" not in path}
+    plain = {path: what for path, what in kind_of.items() if "[]" not in path}
     numbers = [path for path, what in plain.items() if what == "number"]
     yield "id", _match_names(plain, _IDS, _INNER_IDS)
-    yield "class", _guess_classes(inside)
-    places = [at for at in _guess_vectors(inside, _PLACE, bare=True) if not _NO_PLACE.search(at[0].rpartition(".")[0])]
+    yield "class", _guess_classes(kind_of)
+    places = [at for at in _guess_vectors(kind_of, _PLACE, bare=True) if not _NO_PLACE.search(at[0].rpartition(".")[0])]
     for k, axis in enumerate(_AXES):
         yield f"{axis}_m", [at[k] for at in places if len(at) > k]
-    yield "yaw_rad", _guess_yaws(inside, numbers)
-    sizes = _guess_vectors(inside, _SIZE)
+    yield "yaw_rad", _guess_yaws(kind_of, numbers)
+    sizes = _guess_vectors(kind_of, _SIZE)
     for k, side in enumerate(("length", "width", "height")):
         # a single letter counts only where `l` and `w` are both there: a lone `w` may be of a quaternion
         both = [p for p in numbers if len(p.rpartition(".")[2]) > 1 or {p[:-1] + "l", p[:-1] + "w"} <= {*numbers}]
         named = _match_names(dict.fromkeys(both, "number"), (side, f"{side}_m", side[0]), ())
         yield f"{side}_m", named or [at[k] for at in sizes if len(at) > k]
-    speeds = [at for at in _guess_vectors(inside, _SPEED) if not re.search(r"(?i)angular|accel|covar|std", at[0])]
+    speeds = [at for at in _guess_vectors(kind_of, _SPEED) if not re.search(r"(?i)angular|accel|covar|std", at[0])]
     flat = [[x, y] for x, y in (("vx", "vy"), ("vx_mps", "vy_mps"), ("vel_x", "vel_y")) if {x, y} <= {*numbers}]
     for k, axis in enumerate("xy"):
         yield f"v{axis}_mps", [at[k] for at in [*flat, *speeds]][:1]
@@ -140,28 +140,28 @@ def _match_names(paths: Mapping[str, str], names: Sequence[str], inner: Sequence
     return [path for _, path in sorted(ranked)]
 
 
-def _guess_classes(inside: Mapping[str, str]) -> list[Any]:
+def _guess_classes(kind_of: Mapping[str, str]) -> list[Any]:
     """Fields of the class: plain ones, and fields of a list of guesses, with the probability beside."""
     single = _match_names(
-        {p: w for p, w in inside.items() if "[]" not in p}, _CLASSES, ("label", "class_id", "name", "type")
+        {p: w for p, w in kind_of.items() if "[]" not in p}, _CLASSES, ("label", "class_id", "name", "type")
     )
     lists = []
     for path in _match_names(
-        {p: w for p, w in inside.items() if p.count("[]") == 1}, _CLASSES, ("label", "class_id", "name")
+        {p: w for p, w in kind_of.items() if p.count("[]") == 1}, _CLASSES, ("label", "class_id", "name")
     ):
-        beside = list_level(path)
+        level = list_level(path)
         share = next(
-            (f"{beside}.{n}" for n in ("probability", "score", "confidence") if f"{beside}.{n}" in inside), None
+            (f"{level}.{n}" for n in ("probability", "score", "confidence") if f"{level}.{n}" in kind_of), None
         )
-        if path != beside:
+        if path != level:
             lists.append({"path": path} | ({"probability": share} if share else {}))
-    return [*lists, *single] if lists and not any(inside[p] == "text" for p in single) else [*single, *lists]
+    return [*lists, *single] if lists and not any(kind_of[p] == "text" for p in single) else [*single, *lists]
 
 
-def _guess_vectors(inside: Mapping[str, str], kind: str, *, bare: bool = False) -> list[list[str]]:
+def _guess_vectors(kind_of: Mapping[str, str], kind: str, *, bare: bool = False) -> list[list[str]]:
     """Vectors: fields x, y, z of a structure named `kind`, `kind_x`, or items of a list; `bare`: of the object too."""
     candidates: dict[str, list[str]] = {}
-    for path, what in inside.items():
+    for path, what in kind_of.items():
         if what != "number":
             continue
         head, _, last = path.rpartition(".")
@@ -176,23 +176,23 @@ def _guess_vectors(inside: Mapping[str, str], kind: str, *, bare: bool = False) 
         elif path.endswith("[]") and path.count("[]") == 1 and re.fullmatch(f"(?i).*{kind}", last.removesuffix("[]")):
             candidates[path] = [f"{path.removesuffix('[]')}[{k}]" for k in range(3)]
     vectors = []
-    for path, whole in candidates.items():
-        numbers = whole if path.endswith("[]") else [axis for axis in whole if inside.get(axis) == "number"]
-        if len(numbers) >= 2 and numbers[:2] == whole[:2]:
+    for path, components in candidates.items():
+        numbers = components if path.endswith("[]") else [axis for axis in components if kind_of.get(axis) == "number"]
+        if len(numbers) >= 2 and numbers[:2] == components[:2]:
             vectors.append(numbers)
     return sorted(vectors, key=lambda at: (at[0].count("."), at[0]))
 
 
-def _guess_yaws(inside: Mapping[str, str], numbers: Sequence[str]) -> list[Any]:
+def _guess_yaws(kind_of: Mapping[str, str], numbers: Sequence[str]) -> list[Any]:
     plain = dict.fromkeys(numbers, "number")
     radians = _match_names(plain, ("yaw", "yaw_rad", "heading", "heading_rad", "psi", "theta", "rotation_z", "rz"), ())
     degrees = _match_names(plain, ("yaw_deg", "heading_deg", "yaw_degrees", "heading_degrees"), ())
-    turned = [
+    quaternions = [
         {"quaternion": head}
         for path in numbers
-        if (head := path.rpartition(".")[0]) and path.endswith(".w") and all(f"{head}.{a}" in inside for a in _AXES)
+        if (head := path.rpartition(".")[0]) and path.endswith(".w") and all(f"{head}.{a}" in kind_of for a in _AXES)
     ]
-    return [*radians, *({"degrees": path} for path in degrees), *turned]
+    return [*radians, *({"degrees": path} for path in degrees), *quaternions]
 
 
 # Proposals for the channels of a recording, tried on it.

@@ -204,29 +204,29 @@ def suggest_experiment(
     objects = truth.row_object_ix
     number = scene.ego_ix if ego is None or isinstance(ego, dict) else scene.object_number.get(ego, -1)
     away_m = _measure_away(truth, number, next((unit.middle_m for unit in units if unit.problem is None), None))
-    others = scene.moving & (np.arange(len(scene.moving)) != number)
-    groups = {name: others & np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")}
-    groups["all"] = others
+    measurable = scene.moving & (np.arange(len(scene.moving)) != number)
+    groups = {name: measurable & np.isin(scene.object_class, class_indices((name,))) for name in ("vru", "vehicles")}
+    groups["all"] = measurable
 
-    def ask(which: Bool, range_m: float) -> tuple[list[Mast], dict[str, int], bool]:
+    def ask(mask: Bool, range_m: float) -> tuple[list[Mast], dict[str, int], bool]:
         """Masts for some objects within a range, how these begin, and whether any comes back."""
-        rows = np.flatnonzero(which[objects] if away_m is None else which[objects] & (away_m <= range_m))
+        rows = np.flatnonzero(mask[objects] if away_m is None else mask[objects] & (away_m <= range_m))
         masts = _suggest_masts(truth, rows if len(rows) else np.arange(len(objects)), objects)
         near_m = np.hypot(truth.x_m[0] - masts[0].at[0], truth.y_m[0] - masts[0].at[1]) if away_m is None else away_m
-        return masts, *_count_began(truth, near_m, which, range_m)
+        return masts, *_count_began(truth, near_m, mask, range_m)
 
-    found = ((name, which, range_m) for range_m in (*RANGES_M, np.inf) for name, which in groups.items())
-    name, range_m, (masts, began, again) = next(
-        ((name, range_m, asked) for name, which, range_m in found if sum((asked := ask(which, range_m))[1].values())),
-        ("all", RANGES_M[0], ask(others, RANGES_M[0])),
+    found = ((name, mask, range_m) for range_m in (*RANGES_M, np.inf) for name, mask in groups.items())
+    name, range_m, (masts, began, returns) = next(
+        ((name, range_m, asked) for name, mask, range_m in found if sum((asked := ask(mask, range_m))[1].values())),
+        ("all", RANGES_M[0], ask(measurable, RANGES_M[0])),
     )
-    few = dict[str, int]()
+    too_few = dict[str, int]()
     if name != "all" and sum(began.values()) < FEWEST_COUNTED:
-        of_all = ask(others, range_m)
+        of_all = ask(measurable, range_m)
         if sum(of_all[1].values()) > sum(began.values()):
-            few, name, (masts, began, again) = {name: sum(began.values())}, "all", of_all
+            too_few, name, (masts, began, returns) = {name: sum(began.values())}, "all", of_all
     classes, within_m = None if name == "all" else [name], None if range_m == np.inf else range_m
-    return Suggestion(ego, why, classes, few, within_m, AGAIN_AFTER_S if again else None, began, masts)
+    return Suggestion(ego, why, classes, too_few, within_m, AGAIN_AFTER_S if returns else None, began, masts)
 
 
 def _measure_away(truth: Tracks, ego_ix: int, place_m: Sequence[float] | None) -> Float | None:
@@ -243,19 +243,19 @@ def _count_began(truth: Tracks, away_m: Float, measured: Bool, range_m: float) -
     """How often the objects `measured (N,)` begin how within a range, as `find_episodes` has it, and whether any comes
     back. A row `away_m (P,)` is NaN where nothing is asked. Who has no frame after its onset does not count.
     """
-    objects, time_s, asked = truth.row_object_ix, truth.row_captured_s, ~np.isnan(away_m)
+    objects, time_s, known = truth.row_object_ix, truth.row_captured_s, ~np.isnan(away_m)
     first_s, last_s = np.full(len(measured), np.inf), np.full(len(measured), -np.inf)
-    np.minimum.at(first_s, objects[asked], time_s[asked])
-    np.maximum.at(last_s, objects[asked], time_s[asked])
+    np.minimum.at(first_s, objects[known], time_s[known])
+    np.maximum.at(last_s, objects[known], time_s[known])
     near = np.flatnonzero((away_m <= range_m) & measured[objects] & (time_s < last_s[objects]))
     new = np.diff(objects[near], prepend=-1) != 0
-    back = ~new & (np.diff(time_s[near], prepend=-np.inf) > AGAIN_AFTER_S)
-    onset = near[new | back]
+    returned = ~new & (np.diff(time_s[near], prepend=-np.inf) > AGAIN_AFTER_S)
+    onset = near[new | returned]
     at_once = time_s[onset] <= first_s[objects[onset]]
-    at_once |= back[new | back] & (np.diff(truth.frame_ix, prepend=-2)[onset] != 1)
-    at_start = time_s[onset] <= time_s[asked].min(initial=np.inf)
+    at_once |= returned[new | returned] & (np.diff(truth.frame_ix, prepend=-2)[onset] != 1)
+    at_start = time_s[onset] <= time_s[known].min(initial=np.inf)
     groups = {"crossed": ~at_once, "appeared": at_once & ~at_start, "log_start": at_once & at_start}
-    return {word: int(group.sum()) for word, group in groups.items()}, bool(back.any())
+    return {word: int(group.sum()) for word, group in groups.items()}, bool(returned.any())
 
 
 def _suggest_ego(
@@ -271,7 +271,7 @@ def _suggest_ego(
         ident = scene.object_ids[scene.ego_ix]
         return None, f"the log names its host vehicle: {ident} ({CLASSES[scene.object_class[scene.ego_ix]]})", recording
     host = recording.host_id
-    none = "the log names no host vehicle" if host is None else f"the log's host vehicle {host} is no moving object"
+    no_host = "the log names no host vehicle" if host is None else f"the log's host vehicle {host} is no moving object"
     for place in _find_poses(log):
         from copem_replay.io.config import EgoTopic
 
@@ -281,9 +281,9 @@ def _suggest_ego(
         except (RecordingError, BrokenIndexError):
             continue
         if with_ego.scene.ego_ix >= 0:
-            return place, f"{none}; these poses may be the ego's", with_ego
+            return place, f"{no_host}; these poses may be the ego's", with_ego
     ident, why = _find_longest_vehicle(scene, recording.truth)
-    return ident, f"{none}; {why}", recording
+    return ident, f"{no_host}; {why}", recording
 
 
 def _find_poses(log: Log) -> list[dict[str, str]]:

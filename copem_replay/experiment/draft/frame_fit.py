@@ -1,4 +1,4 @@
-"""The frame that fixes of a satellite receiver say of a recording: turn and offset of its metres, fitted to them.
+"""The frame fitted to satellite fixes in a recording: turn and offset of the recording's metres.
 
 A recording with odometry of its own and fixes beside it does not say where it is; both together do. The fit is printed
 by `info` with the key to copy, and never applied.
@@ -71,14 +71,14 @@ class FrameFit:
 
     @property
     def words(self) -> str:
-        """One line, with the key to copy."""
-        told = f"{self.fixes:,} fixes of {self.topic}, over {self.way_m:,.0f} m that the ego gets around"
+        """The fit in one line, with the key to copy."""
+        line = f"{self.fixes:,} fixes of {self.topic}, over {self.way_m:,.0f} m that the ego gets around"
         if not math.isfinite(self.turn_deg):
-            return f"{told}: turn not determined, expected {_LEAST_WAY_M:g} m or more"
+            return f"{line}: turn not determined, expected {_LEAST_WAY_M:g} m or more"
         (lat, lon), (east_m, north_m) = self.origin, self.frame.offset_m
         key = f"frame: {{proj: {{at_wgs84: [{lat:.7f}, {lon:.7f}]}}, offset_m: [{east_m:.2f}, {north_m:.2f}]"
         key += f", yaw_deg: {math.degrees(self.frame.yaw_rad):.3f}}}"
-        return f"{told} fit `{key}`: residual {self.residual_m:.2f} m, turn ± {self.turn_deg:.2g}° (95 %); not applied"
+        return f"{line} fit `{key}`: residual {self.residual_m:.2f} m, turn ± {self.turn_deg:.2g}° (95 %); not applied"
 
 
 def fit_fixes(log: Log, recording: Recording) -> Iterator[FrameFit]:
@@ -91,12 +91,12 @@ def fit_fixes(log: Log, recording: Recording) -> Iterator[FrameFit]:
     way_m = np.stack([truth.x_m[0, rows], truth.y_m[0, rows]], axis=1)
     for fixes in _read_fixes(log):
         after = np.searchsorted(stamp_ns, fixes.stamp_ns).clip(1, len(stamp_ns) - 1)
-        inside = (fixes.stamp_ns >= stamp_ns[0]) & (fixes.stamp_ns <= stamp_ns[-1])
-        inside &= stamp_ns[after] - stamp_ns[after - 1] <= _NEAR_NS
-        at_s, known_s = ((ns - stamp_ns[0]) * 1e-9 for ns in (fixes.stamp_ns[inside], stamp_ns))
+        covered = (fixes.stamp_ns >= stamp_ns[0]) & (fixes.stamp_ns <= stamp_ns[-1])
+        covered &= stamp_ns[after] - stamp_ns[after - 1] <= _NEAR_NS
+        at_s, known_s = ((ns - stamp_ns[0]) * 1e-9 for ns in (fixes.stamp_ns[covered], stamp_ns))
         at_m = np.stack([np.interp(at_s, known_s, way_m[:, k]) for k in (0, 1)], axis=1)
         if len(at_m) > 1:
-            yield fit_frame(fixes.topic, fixes.places[inside], at_m)
+            yield fit_frame(fixes.topic, fixes.places[covered], at_m)
 
 
 def fit_frame(topic: str, places: Float, at_m: Float) -> FrameFit:

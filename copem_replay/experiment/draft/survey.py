@@ -82,10 +82,10 @@ def survey_recording(place: Local | str) -> RecordingSurvey:
             return replace(survey, reason=str(error), proposals=_list_proposals(log, survey.topics), units=units)
         survey = replace(survey, choice=str(error))
     truth, failures = [], []
-    beside = [t.topic for t in survey.topics if t.role == "unit"]
+    unit_topics = [t.topic for t in survey.topics if t.role == "unit"]
     for topic in topics:
         try:
-            recording = read_log(log, name=name_log(path), topic=topic, beside=beside)
+            recording = read_log(log, name=name_log(path), topic=topic, unit_topics=unit_topics)
         except RecordingError as error:
             failures.append(str(error))
             continue
@@ -211,7 +211,7 @@ def _survey_truth(
     between_s = np.diff(truth.stamp_ns) * 1e-9
     longest = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
-    found = list(_survey_units(recording.local, scene, units, recording))
+    found_units = list(_survey_units(recording.local, scene, units, recording))
     return TruthFound(
         topic=recording.topic,
         frames=len(truth.stamp_ns),
@@ -234,9 +234,9 @@ def _survey_truth(
         notes=list(recording.notes),
         place=_describe_place(log, recording),
         vehicles=moving_ids(scene, shown=6),
-        units=found,
+        units=found_units,
         map=_try_map(recording) if recording.together is None and any(t.role == "map" for t in topics) else None,
-        suggested=suggest_experiment(log, recording, found, fields),
+        suggested=suggest_experiment(log, recording, found_units, fields),
     )
 
 
@@ -338,7 +338,7 @@ class ClockFound:
     late: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """`0.130 s (95 %: 0.120 … 0.140 s)` and the drift, or that it cannot be told."""
+        """The offset in words, `0.130 s (95 %: 0.120 … 0.140 s)`, and the drift; or that they cannot be told."""
         offset = self.offset
         if offset.untold is not None:
             return f"cannot be told: {offset.untold}"
@@ -354,17 +354,15 @@ class ClockFound:
         return words
 
     def plain(self) -> dict[str, object]:
-        """The findings for JSON: seconds, and seconds per second; null where they cannot be told, for which see
-        `untold`.
-        """
+        """The findings for JSON: seconds, and seconds per second; null where they cannot be told (`untold`)."""
         offset = self.offset
-        told = offset.untold is None
+        known = offset.untold is None
         return {
             "lists": list(self.lists),
-            "clock_offset_s": offset.offset_s if told else None,
-            "interval_s": [offset.low_s, offset.high_s] if told else None,
-            "drift": offset.drift[0] if told and offset.drift else None,
-            "drift_interval": list(offset.drift[1:]) if told and offset.drift else None,
+            "clock_offset_s": offset.offset_s if known else None,
+            "interval_s": [offset.low_s, offset.high_s] if known else None,
+            "drift": offset.drift[0] if known and offset.drift else None,
+            "drift_interval": list(offset.drift[1:]) if known and offset.drift else None,
             "entries": offset.entries,
             "if_not_shifted": offset.unbiased,
             "untold": offset.untold,
@@ -379,9 +377,7 @@ class _TimedLists:
 
 
 def compare_clocks(paths: Sequence[Path]) -> list[ClockFound]:
-    """The clock of each recording but the first. Raises RecordingError for one that cannot be read or has no object
-    list.
-    """
+    """The clock of each recording but the first. Raises RecordingError: not readable, or no object list."""
     t0_ns: int | None = None
     lists_of: list[list[_TimedLists]] = []
     for path, label in zip(paths, label_files(paths), strict=True):
@@ -394,7 +390,7 @@ def compare_clocks(paths: Sequence[Path]) -> list[ClockFound]:
     return [_find_best(path, lists_of[0], lists) for path, lists in zip(paths[1:], lists_of[1:], strict=True)]
 
 
-def _find_best(path: Path, first: Sequence[_TimedLists], others: Sequence[_TimedLists]) -> ClockFound:
+def _find_best(path: Path, first: Sequence[_TimedLists], second: Sequence[_TimedLists]) -> ClockFound:
     """The offset with the narrowest interval, among the pairs of lists with the fewest unknown delays."""
     from copem_replay.io.clock_offset import estimate_time_offset
 
@@ -403,13 +399,11 @@ def _find_best(path: Path, first: Sequence[_TimedLists], others: Sequence[_Timed
             path,
             (a.name, b.name),
             estimate_time_offset(a.entries, b.entries),
-            tuple(one.name for one in (a, b) if not one.captures_said),
+            tuple(timed.name for timed in (a, b) if not timed.captures_said),
         )
-        for a, b in product(first, others)
+        for a, b in product(first, second)
     ]
-    return min(
-        clocks, key=lambda one: (one.offset.untold is not None, len(one.late), one.offset.high_s - one.offset.low_s)
-    )
+    return min(clocks, key=lambda c: (c.offset.untold is not None, len(c.late), c.offset.high_s - c.offset.low_s))
 
 
 def _read_timed_lists(log: Log, label: str, t0_ns: int) -> Iterator[_TimedLists]:

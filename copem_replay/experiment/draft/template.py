@@ -64,12 +64,12 @@ class _Drive:
 
     @property
     def measured(self) -> dict[str, str]:
-        """The keys of `measure` that a log may have for itself, as text."""
-        again = "" if self.guess.again_after_s is None else f", again_after_s: {self.guess.again_after_s:g}"
+        """The text of the keys of `measure` that a log may set for itself."""
+        suffix = "" if self.guess.again_after_s is None else f", again_after_s: {self.guess.again_after_s:g}"
         near = "appears" if self.guess.range_m is None else f"in_range, range_m: {self.guess.range_m:g}"
         return {
             "objects": f"{{classes: {dump_on_one_line(self.guess.classes)}}}",
-            "onset": f"{{kind: {near}{again}}}",
+            "onset": f"{{kind: {near}{suffix}}}",
             "distance_to": "ego" if self.has_ego else self.units[0],
         }
 
@@ -155,34 +155,34 @@ def _draft_logs(drives: Sequence[_Drive], units: Sequence[str], recorded: Mappin
     for drive in drives:
         truth = drive.truth
         yield f"  - file: {quote_yaml(drive.survey.log)}   # {truth.span_s:.1f} s: {_describe_objects([truth])}"
-        own = [*_draft_read(drive.survey, truth), *_draft_ego(truth, drive.guess), _draft_window(truth)]
-        own += _draft_unreadable(truth)
+        own_keys = [*_draft_read(drive.survey, truth), *_draft_ego(truth, drive.guess), _draft_window(truth)]
+        own_keys += _draft_unreadable(truth)
         changed = {
             "units": _draft_own_units(drive, units, recorded),
             "measure": [f"{key}: {of}" for key, of in drive.measured.items() if of != drives[0].measured[key]],
         }
-        own += [f"{key}: {{{', '.join(of)}}}" for key, of in changed.items() if of]
+        own_keys += [f"{key}: {{{', '.join(of)}}}" for key, of in changed.items() if of]
         if _sum_few(drives) is None and (few := _sum_few([drive])) is not None:
-            own.append(f"# all classes are measured here: {few[0]}")
-        yield from (f"    {line}" for line in own)
+            own_keys.append(f"# all classes are measured here: {few[0]}")
+        yield from (f"    {line}" for line in own_keys)
 
 
 def _draft_own_units(drive: _Drive, units: Sequence[str], recorded: Mapping[str, UnitFound]) -> list[str]:
     """What is otherwise of the units in one log: their places, and those that it lacks."""
-    masts, own = iter(drive.guess.masts), {}
+    masts, changes = iter(drive.guess.masts), {}
     for name in units:
         if name not in drive.units:
-            own[name] = "null"
+            changes[name] = "null"
         elif name in _MASTS:
             mast = next(masts)
-            own[name] = f"{{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}}}"
+            changes[name] = f"{{at: {dump_on_one_line(mast.at)}, yaw_deg: {mast.yaw_deg}}}"
         elif name in recorded:
             unit = drive.lists[name]
             keys = [] if drive.has_ego else [f"at: {dump_on_one_line(unit.middle_m)}"]
             of = _format_recorded(unit)
             keys += [f"recorded: {of}"] * (of != _format_recorded(recorded[name]))
-            own |= {name: f"{{{', '.join(keys)}}}"} if keys else {}
-    return [f"{name}: {of}" for name, of in own.items()]
+            changes |= {name: f"{{{', '.join(keys)}}}"} if keys else {}
+    return [f"{name}: {of}" for name, of in changes.items()]
 
 
 def _draft_unreadable(truth: TruthFound) -> Iterator[str]:
@@ -192,15 +192,13 @@ def _draft_unreadable(truth: TruthFound) -> Iterator[str]:
 
 
 def take_proposal(survey: RecordingSurvey) -> RecordingSurvey | None:
-    """The survey as it can be drafted: as it is where it is readable, else with the best list that is read by the names
-    of its fields; None: no proposal is complete.
-    """
+    """The survey where it is readable, else with the best proposal by names of fields; None: none is complete."""
     if survey.readable:
         return survey
-    whole = [(truth, proposal) for proposal in survey.proposals if (truth := proposal.truth) is not None]
-    if not whole:
+    complete = [(truth, proposal) for proposal in survey.proposals if (truth := proposal.truth) is not None]
+    if not complete:
         return None
-    truth, best = max(whole, key=lambda one: one[0].states)
+    truth, best = max(complete, key=lambda pair: pair[0].states)
     return replace(survey, truth=[truth], proposals=[best])
 
 
@@ -357,15 +355,15 @@ def _draft_links(drives: Sequence[_Drive]) -> Iterator[str]:
 
 def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iterator[str]:
     """Configurations: the truth, all units by ideal and by a real fusion, each on its own, and all of them late."""
-    every, gnn = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}"
+    start, gnn = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}"
     ego = [name for name in units if name.startswith("ego")]
     others = [name for name in recorded if name not in ego]
     rows = [
         ("GT", "{units: truth}", "all that is there, at once, without error"),
-        ("ideal", f"{every}, fusion: {{kind: ideal}}}}", "all units, fused by truth ids: the baseline of `compare`"),
+        ("ideal", f"{start}, fusion: {{kind: ideal}}}}", "all units, fused by truth ids: the baseline of `compare`"),
     ]
     if len(units) > 1:
-        rows.append(("gnn", f"{every}, {gnn}}}", "a fusion without truth ids"))
+        rows.append(("gnn", f"{start}, {gnn}}}", "a fusion without truth ids"))
     if ego:
         rows.append(("alone", f"{{units: [{', '.join(ego)}], {gnn}}}", "the vehicle on its own"))
     elif "roadside" in units:
@@ -373,12 +371,12 @@ def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iter
     rows += [(name, f"{{units: [{name}], {gnn}}}", "as it was recorded") for name in others]
     if len(others) > 1 and {*others} != {*units}:
         rows.append(("recorded", f"{{units: [{', '.join(others)}], {gnn}}}", "all of them"))
-    rows.append(("late", f"{every}, {gnn}, latency_s: 0.5}}", "all lists half a second late"))
+    rows.append(("late", f"{start}, {gnn}, latency_s: 0.5}}", "all lists half a second late"))
     link = f"{{{', '.join(f'{name}: none' for name in ego)}, default: radio}}" if ego else "radio"
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
         yield f"  {name + ':':<{width}} {value}   # {what}"
-    yield f"  # radio: {every}, {gnn}, link: {link}}}   # the lists{' of the others' * bool(ego)} by radio"
+    yield f"  # radio: {start}, {gnn}, link: {link}}}   # the lists{' of the others' * bool(ego)} by radio"
 
 
 def _draft_outputs(outputs: Mapping[str, UnitFound], recorded: Sequence[str]) -> Iterator[str]:
@@ -602,11 +600,11 @@ def _unit_lines(unit: UnitFound) -> list[str]:
     """The lines on the lists of one unit."""
     if unit.problem:
         return [f"unit {unit.topic}: {unit.problem}"]
-    unsaid = [] if unit.covariances_said else ["covariances"]
-    unsaid += [] if unit.captures_said else ["captures"]
+    missing = [] if unit.covariances_said else ["covariances"]
+    missing += [] if unit.captures_said else ["captures"]
     counts = f"{count_noun(unit.lists, 'list')}, {count_noun(unit.entries, 'entry', 'entries')}"
     counts += f", {unit.rate_hz:.2f} Hz (median)" if unit.rate_hz is not None else ""
-    lines = [f"unit {unit.topic}: {counts}" + (f"; without {' and '.join(unsaid)}" if unsaid else "")]
+    lines = [f"unit {unit.topic}: {counts}" + (f"; without {' and '.join(missing)}" if missing else "")]
     if unit.delay is not None:
         lines.append(f"  delay_s against the truth {'' if unit.delay_s is None else 'is '}{unit.delay}")
     return lines + [f"  {line}" for line in unit.oddities]

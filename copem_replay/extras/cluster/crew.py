@@ -278,7 +278,7 @@ class Crew:
         """
         store, tasks, missing = self._parts.store, [], dict[str, list[str]]()
         store.refresh()
-        for recording in sorted(recordings, key=lambda one: -StudyLog(one, experiment).object_states):
+        for recording in sorted(recordings, key=lambda known_log: -StudyLog(known_log, experiment).object_states):
             log = StudyLog(recording, experiment, self._parts)
             if names := [name for name in list_parts(log, experiment) if not store.exists(name)]:
                 settings = (one for one in experiment.logs if isinstance(one, LogSettings) and one.name == log.name)
@@ -300,13 +300,13 @@ class Crew:
         return len(self._lost) > lost_before
 
     def _make_task(self, experiment: Experiment, name: str, place: Place, settings: LogSettings | None) -> Task:
-        written = experiment.as_written()
-        del written["logs"]
+        data = experiment.as_written()
+        del data["logs"]
         if settings is not None:
             entry = relocate_settings(settings, place).model_copy(update={"name": name})
-            written["logs"] = [entry.model_dump(mode="json", by_alias=True)]
+            data["logs"] = [entry.model_dump(mode="json", by_alias=True)]
         made_by = tuple(sorted(take_fingerprint().items()))
-        return Task(name, place, json.dumps(written), os.getcwd(), self._parts.address, made_by, self._command)
+        return Task(name, place, json.dumps(data), os.getcwd(), self._parts.address, made_by, self._command)
 
     @property
     def notes(self) -> list[str]:
@@ -338,9 +338,7 @@ class Crew:
         self._tell(self._progress)
 
     def _do_all(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Receipt]]:
-        """The receipts of tasks as they come. A task at which workers died is tried once more, alone: it may have died
-        of another.
-        """
+        """The receipts of tasks as they come. A task at which workers died is tried once more, alone."""
         waiting, suspects, flying = deque(tasks), deque[Task](), dict[Future[Receipt], tuple[Task, bool]]()
         self._report()
         try:
@@ -354,12 +352,12 @@ class Crew:
                 finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)
                 self._report()
                 for future in finished:
-                    task, alone = flying.pop(future)
+                    task, was_alone = flying.pop(future)
                     try:
                         receipt = self._receive(future, task)
                     except WorkerDiedError as error:
-                        suspects += [] if alone else [task]
-                        self._lost |= {place_identity(task.place): error} if alone else {}
+                        suspects += [] if was_alone else [task]
+                        self._lost |= {place_identity(task.place): error} if was_alone else {}
                         continue
                     yield task, receipt
                     self._report(1)

@@ -168,12 +168,12 @@ def _check_certificates(address: str) -> None:
 
     try:
         context = distributed.Security().get_connection_args("client")["ssl_context"]
-        found = "none" if context is None else ""
+        fault = "none" if context is None else ""
     except OSError as error:  # no such file, or not a certificate with its key (ssl.SSLError)
-        found = _format_error(error)
-    if found:
+        fault = _format_error(error)
+    if fault:
         out = f"set {_TLS}CA_FILE and {_TLS}CLIENT__CERT"
-        raise InputError(f"--cluster: {address}: expected certificates in Dask's settings, found {found}; {out}")
+        raise InputError(f"--cluster: {address}: expected certificates in Dask's settings, found {fault}; {out}")
 
 
 def _start_local(count: int) -> Any:

@@ -107,12 +107,12 @@ def kind_from_name(name: str) -> OsiKind | None:
     """
     if name in KINDS:
         return KINDS[name]
-    if (meant := class_from_name(name)) is None:
+    if (class_name := class_from_name(name)) is None:
         return None
     within, moves = name.lower().replace("_", " "), not stands(name)
     alike = [kind for kind in KINDS.values() if kind.moving == moves and kind.name in within]
-    default = KINDS[meant if moves else "static"]
-    return next((kind for kind in alike if not moves or kind.class_name == meant), default)
+    default = KINDS[class_name if moves else "static"]
+    return next((kind for kind in alike if not moves or kind.class_name == class_name), default)
 
 
 # Rotations as matrices, (…, 3, 3), and the yaw of one.
@@ -443,33 +443,33 @@ def plan_outputs(
     """
     if not source.exists():
         raise InputError(f"{source}: no such file or folder")
-    found: dict[str, PlannedRecording] | None = None
+    planned: dict[str, PlannedRecording] | None = None
     if (listing := getattr(_import_format(format), "list_recordings", None)) is not None:
-        found = listing(source)
-    if only is not None and found is not None:
-        if only not in found:
-            raise InputError(f"--only: {unknown_name_message('recording', only, found)}")
-        found = {only: found[only]}
-    if found is None or (only is not None and out.suffix == ".mcap"):
+        planned = listing(source)
+    if only is not None and planned is not None:
+        if only not in planned:
+            raise InputError(f"--only: {unknown_name_message('recording', only, planned)}")
+        planned = {only: planned[only]}
+    if planned is None or (only is not None and out.suffix == ".mcap"):
         if out.suffix != ".mcap":
             raise InputError(f"{out}: expected an output that ends in .mcap, found {out.name!r}")
-        asked = {out: next(iter(found.values())) if found else PlannedRecording(source)}
+        outputs = {out: next(iter(planned.values())) if planned else PlannedRecording(source)}
     else:
         if out.suffix == ".mcap" or out.is_file():
             raise InputError(f"{out}: expected a folder for the recordings of one, found a file's name")
-        asked = {out / f"{name}.mcap": part for name, part in found.items()}
-    for path in asked:
+        outputs = {out / f"{name}.mcap": part for name, part in planned.items()}
+    for path in outputs:
         check_outputs({"--out": path}, [source])
         check_output(path, is_converted)
-    for folder in {path.parent for path in asked}:
+    for folder in {path.parent for path in outputs}:
         if find_scratch_names(folder):  # of conversions that were killed
-            for path in asked:
+            for path in outputs:
                 remove_leftovers(path, folder)
-    existing = [path for path in asked if path.is_file()]
+    existing = [path for path in outputs if path.is_file()]
     if existing and not overwrite:
         more = f", and {count_noun(len(existing) - 1, 'other')}" if len(existing) > 1 else ""
         raise InputError(f"{existing[0]}: is there already{more}; give another name, or --overwrite")
-    return asked
+    return outputs
 
 
 @dataclass
@@ -513,20 +513,20 @@ class Conversion:
 
 
 def convert_all(
-    asked: Mapping[Path, PlannedRecording],
+    outputs: Mapping[Path, PlannedRecording],
     conversion: Conversion,
     *,
     format: str,
     options: Mapping[str, Any] | None = None,
     classes: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """Convert every source of `asked` to its output and yield a line per recording, as soon as it is written.
+    """Convert every source of `outputs` to its output and yield a line per recording, as soon as it is written.
 
     `conversion` takes up the notes, and the problems of sources that cannot be converted; the others are converted
     all the same. Nothing further is tried once an output cannot be written.
     """
-    conversion.asked = len(asked)
-    for output, planned in asked.items():
+    conversion.asked = len(outputs)
+    for output, planned in outputs.items():
         try:
             given = {**(options or {}), **planned.options}
             report = convert_source(planned.source, output, format=format, options=given, classes=classes)

@@ -58,32 +58,32 @@ def list_recordings(source: Path) -> dict[str, PlannedRecording]:
     if not source.is_dir():
         raise InputError(f"{source}: expected the folder of a nuScenes or T4 data set, found a file")
     folder = _find_tables(source)
-    found: dict[str, PlannedRecording] = {}
+    scenes: dict[str, PlannedRecording] = {}
     for row in _read_rows(folder / "scene.json", "token", "name"):
         name = avoid_device_name(quote(row["name"], safe=" ")) or row["token"]
-        if name in found:
+        if name in scenes:
             raise InputError(f"{folder / 'scene.json'}: expected one scene {name}, found several")
-        found[name] = PlannedRecording(source, {"scene": row["token"]})
-    if not found:
+        scenes[name] = PlannedRecording(source, {"scene": row["token"]})
+    if not scenes:
         raise InputError(f"{folder / 'scene.json'}: expected scenes, found none")
-    return found
+    return scenes
 
 
 def _find_tables(source: Path) -> Path:
     """The folder with the tables: this one, or the only one of a version below. Raises InputError."""
     if (source / "scene.json").is_file():
         return source
-    found = sorted(
+    folders = sorted(
         {path.parent for pattern in ("*/scene.json", "*/annotation/scene.json") for path in source.glob(pattern)}
     )
-    if len(found) == 1:
-        return found[0]
-    what = (
+    if len(folders) == 1:
+        return folders[0]
+    count_words = (
         "none of them"
-        if not found
-        else f"several: {', '.join(str(path.relative_to(source)) for path in found)}; name one"
+        if not folders
+        else f"several: {', '.join(str(path.relative_to(source)) for path in folders)}; name one"
     )
-    raise InputError(f"{source}: expected the tables of one version (scene.json, sample.json, …), found {what}")
+    raise InputError(f"{source}: expected the tables of one version (scene.json, sample.json, …), found {count_words}")
 
 
 def _read_rows(path: Path, *texts: str) -> Iterator[dict[str, Any]]:
@@ -97,13 +97,13 @@ def _read_rows(path: Path, *texts: str) -> Iterator[dict[str, Any]]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected JSON in UTF-8, found something else: {error}") from None
     decode, space = json.JSONDecoder().raw_decode, json.decoder.WHITESPACE.match  # type: ignore[attr-defined]
-    number, at = 0, space(text, 0).end()
+    number, position = 0, space(text, 0).end()
     try:
-        if text[at : at + 1] != "[":
-            raise InputError(f"{path}: expected a list of rows, found {quote_value(text[at : at + 40])}")
-        at = space(text, at + 1).end()
-        while text[at : at + 1] != "]":
-            row, at = decode(text, at)
+        if text[position : position + 1] != "[":
+            raise InputError(f"{path}: expected a list of rows, found {quote_value(text[position : position + 40])}")
+        position = space(text, position + 1).end()
+        while text[position : position + 1] != "]":
+            row, position = decode(text, position)
             number += 1
             for key in texts:
                 if not isinstance(row, dict) or not isinstance(row.get(key), str):
@@ -111,11 +111,11 @@ def _read_rows(path: Path, *texts: str) -> Iterator[dict[str, Any]]:
                         f"{path}: row {number}: expected an object with the text {key!r}, found {quote_value(row)}"
                     )
             yield row
-            at = space(text, at).end()
-            if text[at : at + 1] == ",":
-                at = space(text, at + 1).end()
-            elif text[at : at + 1] != "]":
-                raise json.JSONDecodeError("Expecting ',' or ']'", text, at)
+            position = space(text, position).end()
+            if text[position : position + 1] == ",":
+                position = space(text, position + 1).end()
+            elif text[position : position + 1] != "]":
+                raise json.JSONDecodeError("Expecting ',' or ']'", text, position)
     except json.JSONDecodeError as error:
         line = text.count("\n", 0, error.pos) + 1
         raise InputError(
@@ -312,16 +312,16 @@ def _fill_between(
     keys: list[tuple[int, dict[int, _Pose]]], rate_hz: float | None, report: ConversionReport
 ) -> Iterator[tuple[int, list[Box]]]:
     """Key frames, and frames between two: of objects that both have, in straight lines, turned the short way."""
-    between = 0
+    interpolated = 0
     for k, (stamp_ns, objects) in enumerate(keys):
         yield stamp_ns, [_make_box(number, pose.kind, pose.values) for number, pose in objects.items()]
-        later_ns, later = keys[k + 1] if k + 1 < len(keys) else (stamp_ns, {})
+        later_ns, after = keys[k + 1] if k + 1 < len(keys) else (stamp_ns, {})
         whole_ns = later_ns - stamp_ns
         if rate_hz is None or not 0 < whole_ns <= _LONGEST_NS:
             continue
         parts = max(1, round(whole_ns * rate_hz / 1e9))
         pairs = [
-            (number, pose, later[number].values - pose.values) for number, pose in objects.items() if number in later
+            (number, pose, after[number].values - pose.values) for number, pose in objects.items() if number in after
         ]
         for _, _, change in pairs:
             change[3] = wrap_yaw(change[3])
@@ -330,12 +330,12 @@ def _fill_between(
                 _make_box(number, pose.kind, pose.values + change * part / parts) for number, pose, change in pairs
             ]
             yield stamp_ns + whole_ns * part // parts, boxes
-        between += parts - 1
-    if between:
+        interpolated += parts - 1
+    if interpolated:
         report.assume(
             f"frames between key frames are interpolated to {rate_hz:g} Hz, of objects that both key frames have"
         )
-        report.count("frame", "interpolated", between)
+        report.count("frame", "interpolated", interpolated)
 
 
 def _make_box(number: int, kind: OsiKind, values: Float) -> Box:

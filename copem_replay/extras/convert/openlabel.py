@@ -70,12 +70,12 @@ def read_transforms(properties: Mapping[str, Any], where: str) -> Edges:
 def find_transform(edges: Edges, source: str, target: str) -> Float | None:
     """(4, 4) matrix from one system to the other by the fewest steps; None: they are not connected."""
     matrices, queue = {source: np.eye(4)}, [source]
-    for here in queue:  # it grows in the loop
-        if here == target:
-            return matrices[here]
+    for system in queue:  # it grows in the loop
+        if system == target:
+            return matrices[system]
         for (start, end), matrix in edges.items():
-            if start == here and end not in matrices:
-                matrices[end] = matrix @ matrices[here]
+            if start == system and end not in matrices:
+                matrices[end] = matrix @ matrices[system]
                 queue.append(end)
     return None
 
@@ -275,8 +275,8 @@ def _upright_box(
 ) -> Box:
     """Return the box upright: the axis closest to the vertical is its height, the first of the others its length."""
     axes = matrix[:3, :3] @ turned
-    up = int(np.argmax(np.abs(axes[2])))
-    along, across = (axis for axis in range(3) if axis != up)
+    vertical = int(np.argmax(np.abs(axes[2])))
+    along, across = (axis for axis in range(3) if axis != vertical)
     x, y, z = (matrix @ np.array([*at_m, 1.0]))[:3].tolist()
     yaw_rad = float(np.arctan2(axes[1, along], axes[0, along]))
-    return Box(ident, kind, (x, y, z), yaw_rad, (size_m[along], size_m[across], size_m[up]))
+    return Box(ident, kind, (x, y, z), yaw_rad, (size_m[along], size_m[across], size_m[vertical]))

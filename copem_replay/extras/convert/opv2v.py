@@ -145,13 +145,13 @@ def _read_keys(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be opened: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected YAML in UTF-8, found something else: {error}") from None
-    kept, used = list[str](), False
+    used_lines, is_used = list[str](), False
     for line in lines:
         if line[:1] not in ("", " ", "-", "#"):
-            used = line.split(":", 1)[0] in _USED
-        kept.append(line if used else "")  # lines keep their numbers
+            is_used = line.split(":", 1)[0] in _USED
+        used_lines.append(line if is_used else "")  # lines keep their numbers
     try:
-        data, _, problems = parse_yaml("\n".join(kept))
+        data, _, problems = parse_yaml("\n".join(used_lines))
     except NotYamlError as error:
         raise InputError(f"{path}:{error.line}: expected YAML, found something else: {error.why}") from None
     if problems:
@@ -212,17 +212,17 @@ def _find_step_s(scenario: Path, numbers: list[int], rate_hz: float | None) -> D
 
 def _find_own_labels(agents: Scenario, vehicles: list[str], united: UnitedLabels) -> dict[str, str]:
     """The id under which others label each vehicle: what is where it is, in most frames that have both."""
-    found: dict[str, str] = {}
+    ids: dict[str, str] = {}
     for name in vehicles:
-        shared, there = Counter[str](), Counter[str]()
+        shared, at_place = Counter[str](), Counter[str]()
         for number, frame in agents[name].items():
             for ident, label in united[number].items():
                 shared[ident] += 1
-                there[ident] += math.dist(label.pose[:2], frame.pose[:2]) <= _SAME_M
-        likely = [ident for ident, count in there.items() if 2 * count > shared[ident] and ident not in found.values()]
+                at_place[ident] += math.dist(label.pose[:2], frame.pose[:2]) <= _SAME_M
+        likely = [ident for ident, count in at_place.items() if 2 * count > shared[ident] and ident not in ids.values()]
         if likely:
-            found[name] = max(likely, key=lambda ident: (there[ident], ident == name))
-    return found
+            ids[name] = max(likely, key=lambda ident: (at_place[ident], ident == name))
+    return ids
 
 
 def _unite_labels(agents: Scenario, number: int, report: ConversionReport) -> dict[str, _Label]:
@@ -304,7 +304,7 @@ def frames(
     names below 0. `rate_hz`: of the frames. `axes`: `left` (CARLA's) or `right`, None: by what the files have.
     """
     agents = _read_scenario(source)
-    fixed = {name for name, own in agents.items() if _is_negative(name) or any(frame.fixed for frame in own.values())}
+    fixed = {name for name, seq in agents.items() if _is_negative(name) or any(frame.fixed for frame in seq.values())}
     for name in (*infrastructure, *([host] if host is not None else [])):
         if name not in agents:
             raise InputError(f"{source}: {unknown_name_message('agent', name, agents)}")
@@ -314,9 +314,9 @@ def frames(
         raise InputError(f"{source}: --host: expected a vehicle, found infrastructure: {host}")
     host = host if host is not None else next(iter(vehicles), None)
     right_handed = axes == "right" or (
-        axes is None and any(f.right_handed for own in agents.values() for f in own.values())
+        axes is None and any(f.right_handed for seq in agents.values() for f in seq.values())
     )
-    numbers = sorted({number for own in agents.values() for number in own})
+    numbers = sorted({number for seq in agents.values() for number in seq})
     step_s = _find_step_s(source, numbers, rate_hz)
     united = {number: _unite_labels(agents, number, report) for number in numbers}
     own_labels = _find_own_labels(agents, vehicles, united)

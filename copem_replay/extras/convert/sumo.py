@@ -117,7 +117,7 @@ def frames(
     types = read_types(type_files)
     # A vehicle and a person may have the same id: both are numbered together, the host first.
     ids: dict[tuple[str, str], int] = {} if host is None else {("vehicle", host): 1}
-    met = host is None
+    host_met = host is None
     report.assume("x and y: front bumper of a vehicle, centre of a person")
     source = read_parts(path, ("fcd-export",))
     next(source)
@@ -135,12 +135,12 @@ def frames(
                 report.count("person", "in a vehicle at a time step: skipped")
                 continue
             key = node.tag, node.attribute("id", path)
-            met |= key == ("vehicle", host)
+            host_met |= key == ("vehicle", host)
             ident = ids.setdefault(key, len(ids) + 1)
             report.names[ident] = " ".join(key)
             boxes.append(_make_box(ident, node, _find_type(node, types, report), path, report))
         yield ConvertedFrame(stamp_ns, boxes, host=None if host is None else 1)
-    if not met:
+    if not host_met:
         vehicles = [name for tag, name in ids if tag == "vehicle" and name != host]
         more = f", … ({len(vehicles)} in all)" if len(vehicles) > _SHOWN else ""
         raise InputError(

@@ -88,13 +88,13 @@ def frames(
         R, t = _read_pose(source / "vehicle-side/calib", ("novatel_to_world", "lidar_to_novatel"), pair.vehicle)
         x, y, z = t.tolist()
         boxes = [Box(1, KINDS["car"], (x, y, z - ego_size_m[2] / 2), math.atan2(R[1, 0], R[0, 0]), ego_size_m)]
-        seen = set[int]()
+        seen_ids = set[int]()
         for number, label in enumerate(_read_list(path), start=1):
             box = _make_box(label, ids, R, t, f"{path}: label {number}", report)
-            if box.id in seen:
+            if box.id in seen_ids:
                 report.count("label", "of an object that the frame has already: skipped")
                 continue
-            seen.add(box.id)
+            seen_ids.add(box.id)
             boxes.append(box)
         report.names |= {number: name for name, number in ids.items()}
         yield ConvertedFrame(pair.stamp_ns, boxes, host=1)

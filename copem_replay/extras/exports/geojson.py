@@ -102,13 +102,13 @@ def _list_units(log: str, experiment: Experiment, frame: Frame) -> Iterator[dict
             continue
         lat, lon = frame.to_wgs84(unit.at)[0]
         heading = round(frame.heading_of_yaw(unit.yaw_deg, lat, lon), 6)
-        said = {"log": log, "unit": name, "pem": unit.pem}
+        properties = {"log": log, "unit": name, "pem": unit.pem}
         place = _write_places(frame, np.array([unit.at]))[0]
         yield _make_feature(
-            "Point", place, **said, what="unit", height_m=unit.height_m, heading_deg_from_true_north=heading
+            "Point", place, **properties, what="unit", height_m=unit.height_m, heading_deg_from_true_north=heading
         )
         for field_m in _place_fields(experiment, unit):
-            yield _make_feature("Polygon", [_write_ring(frame, field_m)], **said, what="field of view")
+            yield _make_feature("Polygon", [_write_ring(frame, field_m)], **properties, what="field of view")
 
 
 def _place_fields(experiment: Experiment, unit: Unit) -> Iterator[Float]:
@@ -151,15 +151,15 @@ def _list_episodes(
 
 def _describe_knowledge(episode: pd.DataFrame) -> dict[str, float | None]:
     """By configuration: the share of runs that detect the object; of these the mean time and distance."""
-    said: dict[str, float | None] = {}
+    shares: dict[str, float | None] = {}
     for name, rows in episode.groupby("configuration", sort=False):
         runs, time_s = rows["runs"].to_numpy(), rows["time_to_detection_s"].to_numpy()
         detected = np.isfinite(time_s)
-        said[f"detected_share {name}"] = round(float(runs[detected].sum() / runs.sum()), 6)
+        shares[f"detected_share {name}"] = round(float(runs[detected].sum() / runs.sum()), 6)
         for key, column in (("ttd_s", "time_to_detection_s"), ("dad_m", "distance_at_detection_m")):
             mean = np.average(rows[column].to_numpy()[detected], weights=runs[detected]) if detected.any() else None
-            said[f"{key} {name}"] = None if mean is None or not np.isfinite(mean) else round(float(mean), 6)
-    return said
+            shares[f"{key} {name}"] = None if mean is None or not np.isfinite(mean) else round(float(mean), 6)
+    return shares
 
 
 def _list_site(log: str, experiment: Experiment, recording: Recording, frame: Frame) -> Iterator[dict[str, Any]]:

@@ -97,16 +97,16 @@ def write_nuscenes(
             file = name if name == TRUTH_FILE else f"{_name_file(name)}.json"
             if file == TRUTH_FILE and name != TRUTH_FILE:
                 raise InputError(f"configuration {name}: expected another name, found that of the file of the truth")
-            found = of_file.setdefault(file, {})
-            found |= {sample: [] for sample in samples}
+            boxes = of_file.setdefault(file, {})
+            boxes |= {sample: [] for sample in samples}
             for row in table.to_dict("records"):
                 if row["object_class"] not in TRACKING_NAMES:
                     unnamed[row["object_class"]] += 1
                     continue
                 sample = samples[row["frame"]]
-                found[sample].append(_describe_box(row, sample))
+                boxes[sample].append(_describe_box(row, sample))
     meta = {f"use_{name}": False for name in ("camera", "lidar", "radar", "map")} | {"use_external": True}
-    texts = {file: json.dumps({"meta": meta, "results": found}) + "\n" for file, found in of_file.items()}
+    texts = {file: json.dumps({"meta": meta, "results": boxes}) + "\n" for file, boxes in of_file.items()}
     notes = [
         f"{count_noun(n, 'box', 'boxes')} of class {name} left out: nuScenes tracks none" for name, n in unnamed.items()
     ]
@@ -174,7 +174,7 @@ def collect_held(results: Results, log: str, run: int) -> TrackedRun:
     replayed, rows = replay_again(results, log, run, tuple(results.experiment.configurations))
     scene, truth = replayed.replay.scene, replayed.replay.truth
     frame_s = thin_frames(truth.captured_s)
-    kept = np.searchsorted(truth.captured_s, frame_s)
+    frame_ix = np.searchsorted(truth.captured_s, frame_s)
     episodes = rows[["object_id", "onset_s", "ended_s"]].drop_duplicates()
     spans = [
         (scene.object_number[str(name)], onset_s, ended_s)
@@ -185,16 +185,16 @@ def collect_held(results: Results, log: str, run: int) -> TrackedRun:
         name: _take_held(fused, scene, frame_s, spans, configurations[name].max_age_s)
         for name, fused in replayed.run_tracks.whole().items()
     }
-    return TrackedRun(log, truth.stamp_ns[kept], _take_truth(truth, scene, frame_s, kept, spans), held)
+    return TrackedRun(log, truth.stamp_ns[frame_ix], _take_truth(truth, scene, frame_s, frame_ix, spans), held)
 
 
 def _take_truth(
-    truth: Tracks, scene: Scene, frame_s: Float, kept: Int, spans: Sequence[tuple[int, float, float]]
+    truth: Tracks, scene: Scene, frame_s: Float, frame_ix: Int, spans: Sequence[tuple[int, float, float]]
 ) -> pd.DataFrame:
     """States of the measured objects at the frames of the truth that are kept (G,)."""
     order, bounds = truth.by_frame
-    rows = [order[bounds[frame] : bounds[frame + 1]] for frame in kept.tolist()]
-    frames = np.repeat(np.arange(len(kept)), [len(of) for of in rows])
+    rows = [order[bounds[frame] : bounds[frame + 1]] for frame in frame_ix.tolist()]
+    frames = np.repeat(np.arange(len(frame_ix)), [len(of) for of in rows])
     flat = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
     counts = truth.valid[0, flat] & _is_measured(truth.row_object_ix[flat], frame_s[frames], spans)
     flat, frames = flat[counts], frames[counts]

@@ -219,11 +219,11 @@ def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, co
 
 def _hold_ends(places_m: Float) -> Float:
     """Places (T, 2) where all are known: those of an absent object are its nearest ones in time."""
-    there = np.flatnonzero(np.isfinite(places_m).all(axis=1))
-    if not len(there):
+    known = np.flatnonzero(np.isfinite(places_m).all(axis=1))
+    if not len(known):
         return np.zeros_like(places_m)
-    every = np.arange(len(places_m))
-    return np.stack([np.interp(every, there, places_m[there, axis]) for axis in range(2)], axis=-1)
+    instants = np.arange(len(places_m))
+    return np.stack([np.interp(instants, known, places_m[known, axis]) for axis in range(2)], axis=-1)
 
 
 def _collect_knowledge(
@@ -232,14 +232,14 @@ def _collect_knowledge(
     replay, experiment = replayed.replay, replayed.experiment
     sight = compute_sight(replay, experiment, [object_ix], replay.rows_of(np.array([object_ix])))
     run_tracks = replayed.run_tracks.whole()
-    time_ns, found = to_nanoseconds(time_s), {}
+    time_ns, knowledge = to_nanoseconds(time_s), {}
     for name, colour in colours.items():
         clock, tracks = read_episode_clocks(replay.scene, table, name), run_tracks[name]
         statuses = compute_status(replay, experiment, name, tracks, sight, clock)
         rows = np.searchsorted(statuses.elapsed_ns, time_ns + SAME_INSTANT_NS, side="right") - 1
         status = np.where(rows >= 0, statuses.status[rows, 0], ABSENT)
         red, green, blue = (channel / 255 for channel in colour)
-        found[name] = _Knowledge(
+        knowledge[name] = _Knowledge(
             (red, green, blue),
             tracks,
             np.searchsorted(elapsed_ns(tracks.fused), time_ns + SAME_INSTANT_NS, side="right") - 1,
@@ -248,7 +248,7 @@ def _collect_knowledge(
             _find_units(replayed, name, replay.scene.t0_ns + time_ns),
             _find_hiding_lines(sight, statuses, rows, status),
         )
-    return found
+    return knowledge
 
 
 def _find_units(replayed: ReplayedRun, name: str, stamps_ns: Int) -> Float:
@@ -275,13 +275,13 @@ def _choose_words(
     column = np.zeros(len(rows), dtype=np.int64)
     reasons = explain_status(scene, replayed.experiment, sight, statuses, rows, column)
     after_s = (known_ns - onset_ns) * 1e-9 if NEVER_NS not in (known_ns, onset_ns) else 0.0
-    told = {
+    words = {
         ABSENT: "absent",
         KNOWN: f"known after {after_s:.2f} s" if after_s > 0 else "known at once",
     }
     name = short_ids(scene)[object_ix]
     labels = reasons.labels.to_pylist()
-    return [told.get(s, label.removeprefix(f"{name} ")) for s, label in zip(status.tolist(), labels, strict=True)]
+    return [words.get(s, label.removeprefix(f"{name} ")) for s, label in zip(status.tolist(), labels, strict=True)]
 
 
 def _find_hiding_lines(sight: Sight, statuses: Status, rows: Int, status: Int) -> Float:
@@ -375,7 +375,7 @@ class _Panel:
         axes.text(0.97 - scale / 2, 0.055, "10 m", transform=axes.transAxes, ha="center", fontsize=7, color=_GREY)
 
     def show(self, frame: int) -> None:
-        """Draw a frame."""
+        """Draw one frame."""
         plot, knowledge, ego_ix = self._plot, self._knowledge, self._plot.replayed.replay.scene.ego_ix
         x, y = plot.centre_m[frame].tolist()
         self._axes.set_xlim(x - self._half_m[0], x + self._half_m[0])

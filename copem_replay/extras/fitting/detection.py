@@ -65,12 +65,12 @@ class DetectionMemoryFit:
 
 
 def pass_starts(pass_ix: Int) -> Int:
-    """(N + 1,) where each pass begins; its rows lie together."""
+    """(N + 1,) the first row of each pass, whose rows lie together, and the end."""
     return np.flatnonzero(np.r_[True, pass_ix[1:] != pass_ix[:-1], True])
 
 
 def build_sequences(listed: Bool, probability: Float, captured_s: Float, pass_ix: Int) -> Sequences:
-    """Hits and misses of the passes, with a few dozen different probabilities: means of those close together."""
+    """Hits and misses of the passes, with a few dozen distinct probabilities: means of close ones."""
     level = np.rint(np.arcsin(np.sqrt(probability)) * (2 * LEVELS / np.pi)).astype(np.int64)
     count = np.maximum(np.bincount(level), 1)
     return Sequences.of(
@@ -79,13 +79,13 @@ def build_sequences(listed: Bool, probability: Float, captured_s: Float, pass_ix
 
 
 def build_common_sequences(rows: FitRows, probability: Float) -> Sequences:
-    """Hits and misses of whole logs, list by list: all objects of a list share one number, as `of: unit` has it."""
+    """Hits and misses of whole logs, list by list: all objects of a list share one number, as with `of: unit`."""
     order = np.lexsort((rows.list, rows.log))
     return build_sequences(rows.listed[order], probability[order], rows.captured_s[order], rows.log[order])
 
 
 def explain_no_memory(listed: Bool, pass_ix: Int) -> str | None:
-    """Why the data do not tell how long detection lasts; None where they do."""
+    """The reason why the data do not tell how long detection lasts; None: they do."""
     passes = len(np.unique(pass_ix))
     for what, where in (("miss", ~listed), ("hit", listed)):
         if not where.any():
@@ -96,19 +96,19 @@ def explain_no_memory(listed: Bool, pass_ix: Int) -> str | None:
 
 
 def fit_detection_memory(
-    seen: Sequences, *, intervals: bool = True, instead: Sequence[Sequences] = ()
+    sequences: Sequences, *, intervals: bool = True, instead: Sequence[Sequences] = ()
 ) -> DetectionMemoryFit:
     """Share and correlation time of the greatest likelihood, given the probabilities of detection, or one of `instead`.
 
     Correlation times from a third of the period up to twenty of the longest pass are tried; the last is `always`.
     """
-    length_s = np.add.reduceat(seen.gap_s, seen.start[:-1]).max()
-    period_s = float(np.median(seen.gap_s[seen.gap_s > 0]))
+    length_s = np.add.reduceat(sequences.gap_s, sequences.start[:-1]).max()
+    period_s = float(np.median(sequences.gap_s[sequences.gap_s > 0]))
     bounds = [tuple(logit(_SHARES).tolist()), tuple(np.log([period_s / 3, 20 * length_s]).tolist())]
 
     def likelihood(at: Float) -> float:
         share, tau_s = expit(at[0]), np.exp(at[1])
-        return max(float(one.log_probability(share, tau_s).sum()) for one in (seen, *instead))
+        return max(float(one.log_probability(share, tau_s).sum()) for one in (sequences, *instead))
 
     shortest, longest = bounds[1]
     starts = [
@@ -117,14 +117,14 @@ def fit_detection_memory(
     ]
     best, top = maximise_likelihood(likelihood, [max(starts, key=likelihood)], bounds)
     share, tau_s = float(expit(best[0])), float(np.exp(best[1]))
-    n = len(seen.listed)
-    effective = n / design_effect(share, tau_s, seen)
+    n = len(sequences.listed)
+    effective = n / design_effect(share, tau_s, sequences)
 
-    def estimate(k: int, value: float, to: Callable[[float], float], ends: tuple[float, float]) -> Estimate:
+    def estimate(k: int, value: float, transform: Callable[[float], float], ends: tuple[float, float]) -> Estimate:
         """With its limits, or the `ends` of all values where the likelihood does not fall enough within bounds."""
         limits = profile_limits(likelihood, best, top, k, bounds) if intervals else (np.nan, np.nan)
         low, high = (
-            end if limit == bound else float(to(limit))
+            end if limit == bound else float(transform(limit))
             for limit, bound, end in zip(limits, bounds[k], ends, strict=True)
         )
         return Estimate(value, low, high, n, effective)
@@ -132,23 +132,23 @@ def fit_detection_memory(
     return DetectionMemoryFit(
         estimate(0, share, expit, (0.0, 1.0)),
         estimate(1, np.inf if best[1] > longest - 0.01 else tau_s, np.exp, (0.0, np.inf)),
-        (top - float(seen.log_probability(0.0, 1.0).sum())) / n,
+        (top - float(sequences.log_probability(0.0, 1.0).sum())) / n,
     )
 
 
-def design_effect(share: float, tau_s: float, seen: Sequences) -> float:
+def design_effect(share: float, tau_s: float, sequences: Sequences) -> float:
     """The factor by which the mean of the lists of a pass varies more than that of independent lists.
 
     1 + 2 Σ (1 − k/m) s²φᵏ over passes of m lists, for any gaps between them.
     """
     total = 0.0
-    for a, b in zip(seen.start[:-1], seen.start[1:], strict=True):
-        since_s = np.cumsum(seen.gap_s[a:b])
+    for a, b in zip(sequences.start[:-1], sequences.start[1:], strict=True):
+        since_s = np.cumsum(sequences.gap_s[a:b])
         ahead = 0.0
         for same in np.exp(-np.diff(since_s) / tau_s).tolist():
             ahead = same * (ahead + 1)
             total += ahead
-    return 1 + 2 * share**2 * total / len(seen.listed)
+    return 1 + 2 * share**2 * total / len(sequences.listed)
 
 
 # Tables of detection.
@@ -288,14 +288,14 @@ def fit_detection(
     allowed = [rung, *(one for one in splits if set(one.split) <= set(by))]
     chosen, more = trial.choose(allowed, simplest)
     rung, table = allowed[chosen], _join_rungs(table, more)
-    apart, others = trial.choose([rung, *(one for one in splits if one not in allowed)], simplest)
+    explained_ix, others = trial.choose([rung, *(one for one in splits if one not in allowed)], simplest)
     notes = tuple(
         f"{one.name}: {others[0].below - one.below:+.3g} nats per list, but --by does not name it" for one in others[1:]
     )
     if rows.listed.all() or not rows.listed.any():
         none = f"no {'miss' if rows.listed.all() else 'hit'} in {count_noun(len(rows.listed), 'list')}"
         notes = (f"{none}: intervals of detection take lists as independent, which cannot be told", *notes)
-    explained = [rung, *(one for one in splits if one not in allowed)][apart]
+    explained = [rung, *(one for one in splits if one not in allowed)][explained_ix]
     memory, why, tried = _choose_memory(rows, pass_ix, trial.chances(explained), simplest, intervals)
     fit = fit_table(rung.entries, np.ones(int(pass_ix.max()) + 1), trial.worth, monotone=monotone)
     fit = fit if tried is None else replace(fit, worth=tried)
@@ -317,8 +317,8 @@ def _choose_memory(
     """
     if (why := explain_no_memory(rows.listed, pass_ix)) is not None:
         return None, why, None
-    own = build_sequences(rows.listed, probability, rows.captured_s, pass_ix)
-    sequences = {False: own}
+    by_object = build_sequences(rows.listed, probability, rows.captured_s, pass_ix)
+    sequences = {False: by_object}
     if (np.bincount(rows.list) > 1).any():
         sequences[True] = build_common_sequences(rows, probability)
     fits = {common: fit_detection_memory(seen, intervals=False) for common, seen in sequences.items()}
@@ -344,13 +344,13 @@ def _add_gains(table: tuple[Rung, ...], memory: DetectionMemoryFit | None) -> tu
     """The tables, and what memory of either kind adds to the chosen one on the passes it is fitted to."""
     if memory is None:
         return table
-    [chosen], most = [one for one in table if one.chosen], max(memory.gains.values())
+    [chosen], most = [rung for rung in table if rung.chosen], max(memory.gains.values())
     names = {False: f"{chosen.name} + memory", True: f"{chosen.name} + memory of all objects"}
-    more = [
+    memory_rungs = [
         Rung(names[common], chosen.score + gain, most - gain, 0.0, common == memory.common, "likelihood")
         for common, gain in memory.gains.items()
     ]
-    return (*(replace(one, below=one.below + most, chosen=False) for one in table), *more)
+    return (*(replace(rung, below=rung.below + most, chosen=False) for rung in table), *memory_rungs)
 
 
 @dataclass(frozen=True)
@@ -388,19 +388,19 @@ class _TableTrial:
 
     def build_axes(self, by: tuple[str, ...]) -> list[_Rung]:
         """Tables from one constant to all axes of `by`, without those that rows are too few to tell from others."""
-        least, alone = LEAST_ROWS * self.worth, np.zeros(1)
+        least, single_node = LEAST_ROWS * self.worth, np.zeros(1)
         values = {"range": self.rows.view.range_m, "visible_share": self.rows.view.visible_share}
-        axes, used = (alone, alone), list[str]()
+        axes, used_names = (single_node, single_node), list[str]()
         ladder = [self._build("constant", axes, [{}])]
         for name in (one for one in by if one in values):
             k = list(values).index(name)
             most = int(min(len(self.pass_ix) / least, _MOST_NODES[name]))
-            nodes = choose_nodes(values[name], most, least, _DECIMALS[name]) if most > 1 else alone
-            nodes = nodes if len(nodes) > 1 else alone
+            nodes = choose_nodes(values[name], most, least, _DECIMALS[name]) if most > 1 else single_node
+            nodes = nodes if len(nodes) > 1 else single_node
             axes = (nodes, axes[1]) if k == 0 else (axes[0], nodes)
-            rung = self._build(" × ".join([*used, _WORDS[name]]), axes, [{}])
+            rung = self._build(" × ".join([*used_names, _WORDS[name]]), axes, [{}])
             if rung.rows.shape != ladder[-1].rows.shape:
-                used.append(_WORDS[name])
+                used_names.append(_WORDS[name])
                 ladder.append(rung)
         return ladder
 
@@ -408,23 +408,23 @@ class _TableTrial:
         """The table split by class, by azimuth and by both, where rows allow it."""
         least, out = LEAST_ROWS * self.worth, list[_Rung]()
         for split in (("class",), ("azimuth",), ("class", "azimuth")):
-            when = rung.when
+            conditions = rung.when
             for name in split:
-                when = _split_conditions(self.rows, when, name, least)
-            if len(when) > max([len(rung.when), *(len(one.when) for one in out if len(split) > 1)]):
+                conditions = _split_conditions(self.rows, conditions, name, least)
+            if len(conditions) > max([len(rung.when), *(len(one.when) for one in out if len(split) > 1)]):
                 words = [*([] if rung.name == "constant" else [rung.name]), *(_WORDS[name] for name in split)]
-                out.append(self._build(" × ".join(words), rung.axes, when, split))
+                out.append(self._build(" × ".join(words), rung.axes, conditions, split))
         return out
 
     def _build(
-        self, name: str, axes: tuple[Float, Float], when: list[dict[str, Any]], split: tuple[str, ...] = ()
+        self, name: str, axes: tuple[Float, Float], conditions: list[dict[str, Any]], split: tuple[str, ...] = ()
     ) -> _Rung:
         values = self.rows.view.range_m, self.rows.view.visible_share
-        where = weigh_nodes(axes, values, _first_that_holds(when, self.rows.view))
-        return _Rung(name, axes, when, where, pool_rows(where, self.rows.listed, self.pass_ix), split)
+        where = weigh_nodes(axes, values, _first_that_holds(conditions, self.rows.view))
+        return _Rung(name, axes, conditions, where, pool_rows(where, self.rows.listed, self.pass_ix), split)
 
 
-def _split_conditions(rows: FitRows, when: list[dict[str, Any]], name: str, least: float) -> list[dict[str, Any]]:
+def _split_conditions(rows: FitRows, conditions: list[dict[str, Any]], name: str, least: float) -> list[dict[str, Any]]:
     """Conditions split by class or azimuth where a part has `least` rows; all other rows are one more condition."""
     if name == "class":
         finer: list[dict[str, Any]] = [{"classes": (CLASSES[k],)} for k in np.unique(rows.view.class_ix)]
@@ -433,13 +433,13 @@ def _split_conditions(rows: FitRows, when: list[dict[str, Any]], name: str, leas
         inner = np.round(np.quantile(degrees, np.arange(1, _SECTORS) / _SECTORS))
         edges = np.unique([np.floor(degrees.min()), *inner, np.ceil(degrees.max())]).tolist()
         finer = [{"azimuth_deg": pair} for pair in pairwise(edges)]
-    parts = [one | other for one, other in product(when, finer)]
+    parts = [one | other for one, other in product(conditions, finer)]
     size = np.bincount(_first_that_holds([*parts, {}], rows.view), minlength=len(parts) + 1)
-    kept = [part for part, rows_there in zip(parts, size, strict=False) if rows_there >= least]
-    if len(kept) + (size.sum() > size[: len(parts)][size[: len(parts)] >= least].sum()) < 2:
-        return when
-    rest_exists = (_first_that_holds([*kept, {}], rows.view) == len(kept)).any()
-    return [*kept, {}] if rest_exists else kept
+    large_parts = [part for part, rows_there in zip(parts, size, strict=False) if rows_there >= least]
+    if len(large_parts) + (size.sum() > size[: len(parts)][size[: len(parts)] >= least].sum()) < 2:
+        return conditions
+    rest_exists = (_first_that_holds([*large_parts, {}], rows.view) == len(large_parts)).any()
+    return [*large_parts, {}] if rest_exists else large_parts
 
 
 def _first_that_holds(when: list[dict[str, Any]], view: ViewGeometry) -> Int:

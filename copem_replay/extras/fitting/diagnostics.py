@@ -79,15 +79,15 @@ def calibration_figure(fit: Fit) -> Figure:
 def ranks_figure(fit: Fit) -> Figure:
     """A strip per statistic, a point per pass: the fitted model above, the model without memory below."""
     assert fit.checks is not None
-    ranks, fresh = ({one.statistic: one.pit for one in checks} for checks in (fit.checks.fitted, fit.checks.memoryless))
+    ranks, white = ({one.statistic: one.pit for one in checks} for checks in (fit.checks.fitted, fit.checks.memoryless))
     verdicts = {one.statistic: one.verdict for one in fit.checks.fitted}
-    names, both = list(ranks), bool(fresh)
+    names, has_white = list(ranks), bool(white)
     with figure_style():
         figure = new_figure(8.0, 1.3 + 0.52 * len(names))
         axes = figure.subplots()
         axes.axvspan(0.025, 0.975, color=FAINT, alpha=0.1, linewidth=0)
-        kinds = [("fitted", ranks, FITTED, "o", -0.17 if both else 0.0)]
-        kinds += [("without memory", fresh, MEMORYLESS, "s", 0.17)] if both else []
+        kinds = [("fitted", ranks, FITTED, "o", -0.17 if has_white else 0.0)]
+        kinds += [("without memory", white, MEMORYLESS, "s", 0.17)] if has_white else []
         for label, of_kind, colour, mark, offset in kinds:
             for k, name in enumerate(names):
                 ranked = np.sort(of_kind.get(name, np.empty(0)))
@@ -102,7 +102,7 @@ def ranks_figure(fit: Fit) -> Figure:
         words = "Rank of the recorded value among replays of the fitted model"
         axes.set(ylim=(len(names) - 0.45, -0.55), xlim=(-0.02, 1.02), xlabel=words)
         axes.grid(visible=False, axis="y")
-        if both:
+        if has_white:
             figure.legend(loc="outside upper left", ncols=2)
         passes = max((len(one) for one in ranks.values()), default=0)
         add_note(figure, [f"{passes} passes; a point each; grey: 95 % of the ranks of a model that is right"])
@@ -141,15 +141,15 @@ def autocorrelation_figure(fit: Fit) -> Figure:
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()
         axes.axhline(0, color=FAINT, linewidth=0.8)
-        enough = n >= _FEWEST
+        has_pairs = n >= _FEWEST
         for column, name, colour, mark in zip(correlations.T, errors.axes, (RECORDED, FITTED), ("o", "^"), strict=True):
-            axes.plot(lags[enough] * period_s, column[enough], mark, color=colour, markersize=4, label=name)
+            axes.plot(lags[has_pairs] * period_s, column[has_pairs], mark, color=colour, markersize=4, label=name)
         dense = np.linspace(period_s / 4, lags[-1] * period_s, 300)
         label = f"fitted: {shares.drift:.2f} e^(−Δ/{shares.tau_s:.2g} s)" if shares.drift else "fitted: "
         label += f" + {shares.constant:.2f}" if shares.constant else ("0" if not shares.drift else "")
         axes.plot(dense, shares.drift * np.exp(-dense / shares.tau_s) + shares.constant, color=INK, linewidth=1.8,
                   label=label)  # fmt: skip
-        least = min(-0.15, float(correlations[enough].min(initial=0)) - 0.05)
+        least = min(-0.15, float(correlations[has_pairs].min(initial=0)) - 0.05)
         axes.set(ylim=(least, 1.02), xlim=(0, None), ylabel="Correlation of their errors")
         axes.set_xlabel("Time between two entries of an object (s)")
         axes.legend(loc="upper right")
@@ -165,12 +165,12 @@ def _mean_products(z: Float, series_ix: Int, at_s: Float, lags: Int, period_s: f
     apart_s = 2 * np.ptp(at_s) + (lags[-1] + 1) * period_s
     key = apart_s * series_ix + at_s  # one axis of time on which series do not meet
     for k, lag in enumerate(lags):
-        later = np.searchsorted(key, key + (lag - 0.5) * period_s)
-        later = np.minimum(later, len(key) - 1)
-        close = (key[later] - key < (lag + 0.5) * period_s) & (key[later] > key)
+        partner = np.searchsorted(key, key + (lag - 0.5) * period_s)
+        partner = np.minimum(partner, len(key) - 1)
+        close = (key[partner] - key < (lag + 0.5) * period_s) & (key[partner] > key)
         n[k] = int(close.sum())
         if n[k]:
-            out[k] = (z[close] * z[later[close]]).mean(axis=0)
+            out[k] = (z[close] * z[partner[close]]).mean(axis=0)
     return out, n
 
 

@@ -35,7 +35,7 @@ def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constan
     n, K = values.shape
     out, variance = np.empty((n, K)), np.empty(n)
     wander, bias = np.zeros(K), np.zeros(K)
-    rest = max(1.0 - drift - constant, 1e-9)
+    white_share = max(1.0 - drift - constant, 1e-9)
     aa, ab, bb = drift, 0.0, constant
     for t in range(n):
         if new[t]:
@@ -49,7 +49,7 @@ def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constan
             for k in range(K):
                 wander[k] *= f
         of_a, of_b = aa + ab, ab + bb
-        s = of_a + of_b + rest
+        s = of_a + of_b + white_share
         gain_a, gain_b, scale = of_a / s, of_b / s, 1.0 / np.sqrt(s)
         for k in range(K):
             innovation = values[t, k] - wander[k] - bias[k]
@@ -70,23 +70,23 @@ def sum_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: flo
     A mean is worth n² over the first effective rows, a variance n² over the second.
     """
     out = np.zeros((2, bins))
-    once, twice, count = np.zeros(bins), np.zeros(bins), np.zeros(bins)
+    lag_sum, square_sum, count = np.zeros(bins), np.zeros(bins), np.zeros(bins)
     for t in range(len(decay)):
         if new[t]:
-            once[:] = 0.0
-            twice[:] = 0.0
+            lag_sum[:] = 0.0
+            square_sum[:] = 0.0
             count[:] = 0.0
         else:
             f = decay[t]
             for b in range(bins):
-                once[b] *= f
-                twice[b] *= f * f
+                lag_sum[b] *= f
+                square_sum[b] *= f * f
         b = bin_ix[t]
-        out[0, b] += 1.0 + 2.0 * (drift * once[b] + constant * count[b])
-        pairs = drift * drift * twice[b] + 2 * drift * constant * once[b] + constant * constant * count[b]
+        out[0, b] += 1.0 + 2.0 * (drift * lag_sum[b] + constant * count[b])
+        pairs = drift * drift * square_sum[b] + 2 * drift * constant * lag_sum[b] + constant * constant * count[b]
         out[1, b] += 1.0 + 2.0 * pairs
-        once[b] += 1.0
-        twice[b] += 1.0
+        lag_sum[b] += 1.0
+        square_sum[b] += 1.0
         count[b] += 1.0
     return out
 
@@ -156,14 +156,14 @@ class ResidualSeries:
         return self._last[1]
 
     def some(self, rows: int) -> Int:
-        """About so many rows: those of every n-th series."""
+        """About `most` rows: those of every n-th series."""
         series_ix = np.cumsum(self.new) - 1
         step = max(len(self.new) // rows, 1)
         return np.flatnonzero(series_ix % step == 0)
 
 
 def whiten_series(values: Float, series: ResidualSeries, shares: MemoryShares) -> tuple[Float, Float]:
-    """Columns (n, K) freed of memory, and the variance of each row given those before it (n,)."""
+    """Columns (n, K) without their memory, and the variance of each row given those before it (n,)."""
     if shares.drift == shares.constant == 0:
         return values, np.ones(len(values))
     decay = series.decay(shares.tau_s)
@@ -269,27 +269,27 @@ def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, interva
         rough = fit_error_memory(z[rows], few, centred=centred, intervals=False)
         first = [rough.shares] if rough.shares.drift > 0 else first
     best = [_pack_shares(one) for one in sorted(first, key=trial.likelihood, reverse=True)[:2]]
-    both, highest = trial.climb("both", best)
-    at, end = _unpack_shares(both), trial.bounds[2][1]
-    lasts = ((at.drift + 0.5 * at.constant, both[2]), (at.drift + at.constant, end - 3.0))
+    peak, highest = trial.climb("both", best)
+    free, end = _unpack_shares(peak), trial.bounds[2][1]
+    lasts = ((free.drift + 0.5 * free.constant, peak[2]), (free.drift + free.constant, end - 3.0))
     instead = [np.array([logit(np.clip(share, 0.01, 0.99)), 0.0, tau]) for share, tau in lasts]
-    found = {
-        "none": trial.climb("none", [both]),
+    climbs = {
+        "none": trial.climb("none", [peak]),
         "constant": trial.climb("constant", [np.zeros(3), np.full(3, -3.0)]),
-        "drift": trial.climb("drift", [both, *instead]),
+        "drift": trial.climb("drift", [peak, *instead]),
     }
-    likelihoods = {name: value for name, (_, value) in found.items()}
+    likelihoods = {name: value for name, (_, value) in climbs.items()}
     likelihoods["both"] = max(highest, likelihoods["drift"])
     chosen = next(name for name, allowed in ALLOWED.items() if likelihoods["both"] - likelihoods[name] <= allowed)
-    if chosen == "both" and min(at.drift, at.constant) < _LEAST:
-        chosen = "drift" if at.constant < _LEAST else "constant"
-    shares = at if chosen == "both" else _unpack_shares(found[chosen][0])
-    parts, untold = _estimate_parts(trial, shares, both, (n, count)) if intervals else ((), None)
+    if chosen == "both" and min(free.drift, free.constant) < _LEAST:
+        chosen = "drift" if free.constant < _LEAST else "constant"
+    shares = free if chosen == "both" else _unpack_shares(climbs[chosen][0])
+    parts, untold = _estimate_parts(trial, shares, peak, (n, count)) if intervals else ((), None)
     return ErrorMemoryFit(shares, parts, likelihoods, untold)
 
 
 def _estimate_parts(
-    trial: _MemoryTrial, shares: MemoryShares, both: Float, counted: tuple[int, int]
+    trial: _MemoryTrial, shares: MemoryShares, peak: Float, counted: tuple[int, int]
 ) -> tuple[tuple[LastingPart, ...], str | None]:
     """The parts with their profile intervals, and what is not told. `counted`: rows and series."""
     n, count = counted
@@ -305,20 +305,20 @@ def _estimate_parts(
         return (), f"no memory in {n} entries of {count} series beyond chance"
     end, parts = trial.bounds[2][1], list[LastingPart]()
     if shares.drift > 0:
-        low, high = trial.limits(both, 2)
+        low, high = trial.limits(peak, 2)
         tau = estimate(shares.tau_s, (float(np.exp(low)), float("inf") if high >= end else float(np.exp(high))))
-        parts.append(LastingPart(estimate(shares.drift, bound_share(both, False)), tau))
+        parts.append(LastingPart(estimate(shares.drift, bound_share(peak, False)), tau))
     if shares.constant > 0:
-        swapped = _pack_shares(_unpack_shares(both), swapped=True)
+        swapped = _pack_shares(_unpack_shares(peak), swapped=True)
         parts.append(LastingPart(estimate(shares.constant, bound_share(swapped, True)), "always"))
     if shares.drift > 0 or not parts:
         return tuple(parts), None
     start = logit(np.clip(shares.constant, 1e-3, 1 - 1e-3))
     best, top = trial.climb("drift", [np.array([start, 0.0, tau]) for tau in (end, end - 3)])
-    only = _FREE["drift"]
+    free_ix = _FREE["drift"]
 
     def drifting(x: Float) -> float:
         return trial.likelihood(MemoryShares(float(expit(x[0])), float(np.exp(x[1]))))
 
-    low, _ = profile_limits(drifting, best[only], top, 1, [trial.bounds[k] for k in only])
+    low, _ = profile_limits(drifting, best[free_ix], top, 1, [trial.bounds[k] for k in free_ix])
     return tuple(parts), f"τ > {np.exp(low):.2g} s or constant"

@@ -83,11 +83,11 @@ class ErrorShape:
 
     @property
     def written(self) -> bool:
-        """Whether the model has Student's t."""
+        """Whether the written model is Student's t."""
         return self.heavier and self.untold is None
 
     def words(self) -> str:
-        """What the tails are like."""
+        """The tails of the errors in words."""
         if not self.heavier:
             return f"tails no heavier than a Gaussian's (excess kurtosis {self.excess_kurtosis:.2g})"
         nu = self.degrees_of_freedom
@@ -137,11 +137,11 @@ class ErrorFit:
             nu = self.shape.degrees_of_freedom
             words = f"{nu.words()}; {self.shape.words()}"
             out |= {"kind": "student_t", "degrees_of_freedom": CommentedValue(round_digits(nu.value, 3), words)}
-        first, between, second = (one.words() for one in bin_.covariance_m2)
+        first, covariance, second = (one.words() for one in bin_.covariance_m2)
         out |= {
             "mean_m": [one.written() for one in bin_.mean_m],
             "covariance_m2": [
-                CommentedValue([xx, xy], f"variance {first}; covariance {between}"),
+                CommentedValue([xx, xy], f"variance {first}; covariance {covariance}"),
                 CommentedValue([xy, yy], f"variance {second}"),
             ],
         }
@@ -154,21 +154,21 @@ class ErrorFit:
         It is taken off what is constant, then off what drifts, for a fit of single objects has it in these.
         """
         out = {name: [part.keys() for part in parts] for name, parts in self.memory.items() if parts}
-        kept = gaussian_share(self.shape.degrees_of_freedom.value) if self.shape.written else 1.0
-        between = None if self.between_logs is None or self.between_logs.untold else self.between_logs
-        left, position = 0.0 if between is None else round(between.share, 3), []
+        normal_share = gaussian_share(self.shape.degrees_of_freedom.value) if self.shape.written else 1.0
+        between_logs = None if self.between_logs is None or self.between_logs.untold else self.between_logs
+        remaining, position = 0.0 if between_logs is None else round(between_logs.share, 3), []
         for part in sorted(
-            self.memory["position"], key=lambda one: between is not None and one.correlation_s != "always"
+            self.memory["position"], key=lambda one: between_logs is not None and one.correlation_s != "always"
         ):
-            taken = min(left, part.share.value)
-            left -= taken
-            words = part.share.words() + (f", of which t keeps {kept:.2g}" if self.shape.written else "")
-            words += f"; {taken:.3g} of it differs between logs" if taken else ""
-            if (less := round(part.share.value / kept - taken, 3)) > 0 or between is None:
+            removed = min(remaining, part.share.value)
+            remaining -= removed
+            words = part.share.words() + (f", of which t keeps {normal_share:.2g}" if self.shape.written else "")
+            words += f"; {removed:.3g} of it differs between logs" if removed else ""
+            if (less := round(part.share.value / normal_share - removed, 3)) > 0 or between_logs is None:
                 position.append(part.keys() | {"share": CommentedValue(less, words)})
-        if between is not None:
-            words = "between logs: " + " and ".join(f"{one.words()} m" for one in between.sigma_m)
-            share = CommentedValue(round(between.share, 3), words)
+        if between_logs is not None:
+            words = "between logs: " + " and ".join(f"{one.words()} m" for one in between_logs.sigma_m)
+            share = CommentedValue(round(between_logs.share, 3), words)
             position.append({"share": share, "correlation_s": "always", "of": "unit"})
         return out | ({"position": position} if position else {})
 
@@ -183,25 +183,25 @@ def remove_pose(fit: ErrorFit, placed: PoseFit) -> ErrorFit:
         return fit
     shift_m2, turn = placed.position_sigma_m.value**2, np.deg2rad(placed.yaw_sigma_deg.value) ** 2
     bins = []
-    for one in fit.bins:
-        near_m, far_m = one.where.range_m
+    for error_bin in fit.bins:
+        near_m, far_m = error_bin.where.range_m
         turned_m2 = turn * (near_m**2 + near_m * far_m + far_m**2) / 3
         parts = (0.0, 1.0) if fit.frame == "line_of_sight" else (0.5, 0.5)
-        first, between, second = one.covariance_m2
+        first, cov, second = error_bin.covariance_m2
         xx, yy = (
             _remove_variance(of, shift_m2 + part * turned_m2) for of, part in zip((first, second), parts, strict=True)
         )
         most = np.sqrt(xx.value * yy.value / (first.value * second.value))
-        bins.append(replace(one, covariance_m2=(xx, replace(between, value=between.value * min(most, 1.0)), yy)))
+        bins.append(replace(error_bin, covariance_m2=(xx, replace(cov, value=cov.value * min(most, 1.0)), yy)))
     return replace(fit, bins=tuple(bins))
 
 
-def _remove_variance(of: Estimate, pose_m2: float) -> Estimate:
+def _remove_variance(variance: Estimate, pose_m2: float) -> Estimate:
     """A variance less that of the pose, and a twentieth of it at least; then the data leave open what it is."""
-    least = of.value / 20
-    value, low, high = (max(one - pose_m2, least) for one in (of.value, of.low, of.high))
-    why = "the pose of the unit explains nearly all of it" if value == least and of.why is None else of.why
-    return replace(of, value=value, low=0.0 if why else low, high=high, why=why)
+    least = variance.value / 20
+    value, low, high = (max(one - pose_m2, least) for one in (variance.value, variance.low, variance.high))
+    why = "the pose of the unit explains nearly all of it" if value == least and variance.why is None else variance.why
+    return replace(variance, value=value, low=0.0 if why else low, high=high, why=why)
 
 
 def fit_errors(rows: FitRows, *, simplest: bool = False) -> ErrorFit:
@@ -210,11 +210,11 @@ def fit_errors(rows: FitRows, *, simplest: bool = False) -> ErrorFit:
     if len(listed) < FEWEST:
         raise InputError(f"{len(listed)} entries are of a true object: errors need at least {FEWEST}")
     entries = rows.take(listed)
-    series, everything = build_series(entries), np.zeros(len(listed), dtype=np.int64)
+    series, one_bin = build_series(entries), np.zeros(len(listed), dtype=np.int64)
     los_m = np.column_stack([entries.along_m, entries.across_m])
-    z = fit_moments(los_m, everything, _EVERYWHERE, series, MemoryShares()).standardised(los_m, everything)
+    z = fit_moments(los_m, one_bin, _EVERYWHERE, series, MemoryShares()).standardised(los_m, one_bin)
     start = fit_error_memory(z, series, centred=True, intervals=False).shares
-    worth = float(fit_moments(los_m, everything, _EVERYWHERE, series, start).freedom.min()) / len(listed)
+    worth = float(fit_moments(los_m, one_bin, _EVERYWHERE, series, start).freedom.min()) / len(listed)
     trial = _ModelTrial(entries, series, worth, simplest)
     frame, (error_m, bins, _), memory, ladder, frames = _choose_model(trial, start)
     bin_ix = find_bin(entries.view, bins)
@@ -258,13 +258,13 @@ def _choose_model(
     last = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last))
     split = class_bins(bins, rows.view, trial.worth)
     if len(split) > len(bins) and not trial.simplest:
-        again = _fit_error_memory(error_m, find_bin(rows.view, split), split, series, memory.shares)
-        gain = trial.gain((error_m, split, again.shares), model) / len(error_m)
+        class_memory = _fit_error_memory(error_m, find_bin(rows.view, split), split, series, memory.shares)
+        gain = trial.gain((error_m, split, class_memory.shares), model) / len(error_m)
         better = gain * len(error_m) > float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
         score = last[bool(memory.parts)].score + gain
         by_class = Rung(f"{name} and class{_MEMORY}", score, max(-gain, 0.0), 0.0, better, "likelihood")
         last = (*(replace(rung, chosen=rung.chosen and not better) for rung in last), by_class)
-        model, memory = ((error_m, split, again.shares), again) if better else (model, memory)
+        model, memory = ((error_m, split, class_memory.shares), class_memory) if better else (model, memory)
     if trial.simplest and memory.parts:
         memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
         last = tuple(replace(rung, chosen=k == 0) for k, rung in enumerate(last))
@@ -326,18 +326,18 @@ class _ModelTrial:
     def choose(self, models: Mapping[str, _Model]) -> tuple[int, tuple[Rung, ...]]:
         """The index of the model that is written, from the simplest to the richest, and the table of all."""
         rows = self.rows
-        _, first, which = np.unique(rows.pass_ix, return_index=True, return_inverse=True)
-        each = list(models.values())
+        _, first, pass_of_row = np.unique(rows.pass_ix, return_index=True, return_inverse=True)
+        candidates = list(models.values())
 
         def score(k: int, held_out: Bool) -> Float:
-            of = held_out[which] | (not held_out.any())
-            rows_of = self._scores(each[k], ~held_out[which], of)
-            return np.bincount(which[of], weights=rows_of, minlength=len(first)).astype(np.float64)
+            scored_rows = held_out[pass_of_row] | (not held_out.any())
+            rows_of = self._scores(candidates[k], ~held_out[pass_of_row], scored_rows)
+            return np.bincount(pass_of_row[scored_rows], weights=rows_of, minlength=len(first)).astype(np.float64)
 
-        numbers = np.array([5 * len(bins) + 3 * (memory is not None) for _, bins, memory in each])
+        numbers = np.array([5 * len(bins) + 3 * (memory is not None) for _, bins, memory in candidates])
         worth = len(rows.log) * self.worth
         return compare_models(
-            list(models), score, rows.fold[first], np.bincount(which), numbers, worth, simplest=self.simplest
+            list(models), score, rows.fold[first], np.bincount(pass_of_row), numbers, worth, simplest=self.simplest
         )
 
     def gain(self, model: _Model, base: _Model) -> float:
@@ -345,19 +345,19 @@ class _ModelTrial:
         whole = np.ones(len(self.rows.log), dtype=bool)
         return float(self._scores(model, whole, whole).sum() - self._scores(base, whole, whole).sum())
 
-    def _scores(self, model: _Model, into: Any, of: Any) -> Float:
-        """Log-likelihood of each of the rows `of` given those before it, fitted to the rows `into`."""
+    def _scores(self, model: _Model, train: Any, test: Any) -> Float:
+        """Log-likelihood of each of the rows `test` given those before it, fitted to the rows `train`."""
         error_m, bins, memory = model
         bin_ix = find_bin(self.rows.view, bins)
-        fitted, scored = build_series(self.rows.take(into)), build_series(self.rows.take(of))
+        fitted, scored = build_series(self.rows.take(train)), build_series(self.rows.take(test))
         shares = memory or MemoryShares()
-        if memory is not None and not np.all(into):
-            first = fit_moments(error_m[into], bin_ix[into], bins, fitted, memory)
-            shares = refit_error_memory(first.standardised(error_m[into], bin_ix[into]), fitted, memory, centred=True)
-        moments = fit_moments(error_m[into], bin_ix[into], bins, fitted, shares)
-        out, variance = whiten_series(moments.standardised(error_m[of], bin_ix[of]), scored, shares)
+        if memory is not None and not np.all(train):
+            first = fit_moments(error_m[train], bin_ix[train], bins, fitted, memory)
+            shares = refit_error_memory(first.standardised(error_m[train], bin_ix[train]), fitted, memory, centred=True)
+        moments = fit_moments(error_m[train], bin_ix[train], bins, fitted, shares)
+        out, variance = whiten_series(moments.standardised(error_m[test], bin_ix[test]), scored, shares)
         log: Float = -0.5 * (out**2).sum(axis=1) - np.log(variance) - np.log(2 * np.pi)
-        scored_: Float = log - moments.log_determinant()[bin_ix[of]]
+        scored_: Float = log - moments.log_determinant()[bin_ix[test]]
         return scored_
 
 
@@ -418,10 +418,10 @@ def _measure_shape(
     nu = float(np.exp(best[0]))
     low, high = np.exp(profile_limits(of, best, value, 0, pairs)) if gain > DROP else (nu, np.inf)
     estimate = Estimate(nu, float(low), float(high), n, float(n))
-    kept = gaussian_share(nu)
+    normal_share = gaussian_share(nu)
     why = None
-    if shares.drift + shares.constant > kept:
-        why = f"what lasts is more than the share of {kept:.2g} of the variance that it could have"
+    if shares.drift + shares.constant > normal_share:
+        why = f"what lasts is more than the share of {normal_share:.2g} of the variance that it could have"
     if simplest or (between is not None and between.untold is None):
         why = "the simplest model was asked for" if simplest else "errors differ between logs, which is written instead"
     return ErrorShape(z, kurtosis, estimate, gain / n, bool(gain > DROP), why)
@@ -460,16 +460,16 @@ def weigh_covariances(moments: Moments, error_m: Float, bin_ix: Int, nu: float) 
     return replace(moments, covariance_m2=scatter * nu / (nu - 2), freedom=moments.freedom / less)
 
 
-def _widen_by_tails(one: ErrorBin, nu: Estimate) -> ErrorBin:
+def _widen_by_tails(error_bin: ErrorBin, nu: Estimate) -> ErrorBin:
     """The variances' limits with those of ν: a variance is ν/(ν − 2) times what the bulk of the errors tells."""
-    at, least, most = (
+    factor, least, most = (
         value / (value - 2) if value > 2.0001 else np.inf for value in (nu.value, min(nu.high, 1e6), nu.low)
     )
 
-    def widen(of: Estimate) -> Estimate:
+    def widen(estimate: Estimate) -> Estimate:
         if not np.isfinite(most):
-            return replace(of, low=of.low * least / at, high=np.inf)
-        return replace(of, low=of.low * least / at, high=of.high * most / at)
+            return replace(estimate, low=estimate.low * least / factor, high=np.inf)
+        return replace(estimate, low=estimate.low * least / factor, high=estimate.high * most / factor)
 
-    xx, xy, yy = one.covariance_m2
-    return replace(one, covariance_m2=(widen(xx), xy, widen(yy)))
+    xx, xy, yy = error_bin.covariance_m2
+    return replace(error_bin, covariance_m2=(widen(xx), xy, widen(yy)))

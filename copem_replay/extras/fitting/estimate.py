@@ -19,7 +19,7 @@ PER_ROW = "per row"
 
 
 def round_digits(value: float, count: int = 4) -> float:
-    """To `count` significant digits: no interval tells more."""
+    """The number rounded to `count` significant digits: no interval tells more."""
     return float(f"{value:.{count}g}")
 
 
@@ -64,7 +64,7 @@ class Estimate:
         return f"{value} (95 %: {limits}, n {self.n}{effective})"
 
     def shown(self) -> tuple[str, str]:
-        """The value and its limits with three digits, or as many as tell the limits apart."""
+        """The value and its limits with three digits, or with as many as tell the limits apart."""
         if math.isclose(self.low, self.high, rel_tol=1e-9):
             return f"{self.value:.3g}", f"the same in all {self.n}"
         digits = next((k for k in range(3, 12) if f"{self.low:.{k}g}" != f"{self.high:.{k}g}"), 3)
@@ -72,7 +72,7 @@ class Estimate:
         return value, f"{low} … {high}"
 
     def written(self, digits: int = 4) -> CommentedValue:
-        """The value as files have it, with its words as a comment."""
+        """The value in the form of files, with its words as a comment."""
         return CommentedValue(round_digits(self.value, digits), self.words())
 
 
@@ -91,7 +91,7 @@ _FAR = 3.0
 
 
 def maximise_likelihood(
-    of: LogLikelihood, starts: Sequence[Sequence[float] | Float], bounds: Bounds
+    logp: LogLikelihood, starts: Sequence[Sequence[float] | Float], bounds: Bounds
 ) -> tuple[Float, float]:
     """Where a log-likelihood of a few numbers is largest, and its maximum: the best of Newton's method from each start.
 
@@ -99,14 +99,15 @@ def maximise_likelihood(
     few numbers fewer calls than L-BFGS (docs/develop/decisions/0032-fitted-errors.md).
     """
     low, high = np.array(bounds, dtype=float).reshape(-1, 2).T
-    maxima = [_climb(of, np.clip(np.asarray(start, dtype=float), low, high), low, high) for start in starts]
-    return max(maxima, key=lambda one: one[1])
+    maxima = [_climb(logp, np.clip(np.asarray(start, dtype=float), low, high), low, high) for start in starts]
+    return max(maxima, key=lambda maximum: maximum[1])
 
 
-def _climb(of: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Float, float]:
-    value, damping = of(point), 1e-3
+def _climb(logp: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Float, float]:
+    """The maximum within bounds that damped Newton steps from a point reach, and its log-likelihood."""
+    value, damping = logp(point), 1e-3
     for _ in range(60 if len(point) else 0):
-        slope, curvature = _differentiate(of, point, value, low, high)
+        slope, curvature = _differentiate(logp, point, value, low, high)
         free = ~(((point <= low) & (slope < 0)) | ((point >= high) & (slope > 0)))
         slope = np.where(free, slope, 0.0)
         curvature *= np.outer(free, free)
@@ -118,60 +119,60 @@ def _climb(of: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Fl
             ahead = np.clip(point + step, low, high)
             if slope @ (ahead - point) < _GAIN:
                 return point, value
-            if (better := of(ahead)) > value:
+            if (better := logp(ahead)) > value:
                 point, value, damping = ahead, better, damping / 8
                 break
             damping *= 10
     return point, value
 
 
-def _differentiate(of: LogLikelihood, point: Float, value: float, low: Float, high: Float) -> tuple[Float, Float]:
+def _differentiate(logp: LogLikelihood, point: Float, value: float, low: Float, high: Float) -> tuple[Float, Float]:
     """Gradient (k,) and curvature (k, k), just inside the bounds."""
     steps = _H * np.eye(len(point))
     point = np.clip(point, low + _H, high - _H)
-    up, down = ([of(point + sign * step) for step in steps] for sign in (1, -1))
-    curvature = np.diag([(u + d - 2 * value) / _H**2 for u, d in zip(up, down, strict=True)])
+    above, beneath = ([logp(point + sign * step) for step in steps] for sign in (1, -1))
+    curvature = np.diag([(u + d - 2 * value) / _H**2 for u, d in zip(above, beneath, strict=True)])
     for i in range(len(point)):
         for j in range(i):
-            both = of(point + steps[i] + steps[j])
-            curvature[i, j] = curvature[j, i] = (both - up[i] - up[j] + value) / _H**2
-    return (np.array(up) - np.array(down)) / (2 * _H), curvature
+            both = logp(point + steps[i] + steps[j])
+            curvature[i, j] = curvature[j, i] = (both - above[i] - above[j] + value) / _H**2
+    return (np.array(above) - np.array(beneath)) / (2 * _H), curvature
 
 
-def profile_limits(of: LogLikelihood, best: Float, value: float, k: int, bounds: Bounds) -> tuple[float, float]:
+def profile_limits(logp: LogLikelihood, best: Float, value: float, k: int, bounds: Bounds) -> tuple[float, float]:
     """The 95 % profile interval of parameter k about the maximum; a bound where the likelihood never falls enough."""
-    others = [j for j in range(len(best)) if j != k]
-    rest = [bounds[j] for j in others]
+    other_ix = [j for j in range(len(best)) if j != k]
+    other_bounds = [bounds[j] for j in other_ix]
     # Near the bounds of log-odds a log-likelihood is flat, and a search that starts there stays there.
-    low, high = ([(1 - a) * one + a * two for one, two in rest] for a in (0.3, 0.7))
+    low, high = ([(1 - a) * one + a * two for one, two in other_bounds] for a in (0.3, 0.7))
 
     def limit(towards: float) -> float:
-        starts = [best[others], np.clip(best[others], low, high)]
+        starts = [best[other_ix], np.clip(best[other_ix], low, high)]
 
         def fall(point: float) -> float:
             nonlocal starts
             if np.array_equal(starts[0], starts[-1]):
                 starts = starts[:1]
-            warm, highest = maximise_likelihood(lambda x: of(np.insert(x, k, point)), starts, rest)
+            warm, highest = maximise_likelihood(lambda x: logp(np.insert(x, k, point)), starts, other_bounds)
             starts = [warm]
             return value - highest - DROP
 
         end, step, inner = bounds[k][0 if towards < 0 else 1], 0.25, float(best[k])
         while True:  # outwards until the likelihood has fallen
             outer = min(inner + step, end) if towards > 0 else max(inner - step, end)
-            if (below := fall(outer)) > 0:
+            if (over := fall(outer)) > 0:
                 break
             if outer == end:
                 return end
             inner, step = outer, 2 * step
         before = fall(inner) if inner != best[k] else -DROP
         for _ in range(6):  # the profile is about a parabola: secants of its root meet fast
-            near, far = np.sqrt(max(before + DROP, 0.0)), np.sqrt(below + DROP)
+            near, far = np.sqrt(max(before + DROP, 0.0)), np.sqrt(over + DROP)
             point = inner + (outer - inner) * np.clip((np.sqrt(DROP) - near) / (far - near), 0.02, 0.98)
-            here = fall(point)
-            if abs(here) < 0.02:
+            gap = fall(point)
+            if abs(gap) < 0.02:
                 return float(point)
-            inner, before, outer, below = (point, here, outer, below) if here < 0 else (inner, before, point, here)
+            inner, before, outer, over = (point, gap, outer, over) if gap < 0 else (inner, before, point, gap)
         return float(inner)
 
     return limit(-1.0), limit(1.0)
@@ -246,8 +247,8 @@ def choose_rung(
     score = scores.sum(axis=1) / weights.sum()
     best = int(np.argmax(score))
     with np.errstate(invalid="ignore"):
-        each = scores[best] - scores
-        without = (each.sum(axis=1, keepdims=True) - each) / (weights.sum() - weights)
+        deficit = scores[best] - scores
+        without = (deficit.sum(axis=1, keepdims=True) - deficit) / (weights.sum() - weights)
         below = score[best] - score
         variance, _ = figure_variance(below, without, np.asarray(weights, dtype=float))
     below[best] = 0.0

@@ -27,13 +27,13 @@ def log_classes(shares: Float, listed: Int, decay: Float, new: Bool, share: floa
     cells, total = np.zeros(C), 0.0
     for t in range(n):
         f = 0.0 if new[t] else decay[t]
-        at = listed[t]
-        fresh = (1.0 - share) * shares[t, at]
+        class_ix = listed[t]
+        p_new = (1.0 - share) * shares[t, class_ix]
         for k in range(C):
             cells[k] = f * cells[k] + (1.0 - f) * shares[t, k]
-        probability = fresh + share * cells[at]
+        probability = p_new + share * cells[class_ix]
         for k in range(C):
-            cells[k] *= (fresh + share if k == at else fresh) / probability
+            cells[k] *= (p_new + share if k == class_ix else p_new) / probability
         total += np.log(probability)
     return total
 
@@ -45,27 +45,27 @@ def link_entries(follows: Int, begin: Int, x_m: Float, y_m: Float, ids: Int, gat
     Entries lie list by list, those of list k from `begin[k]` on. `follows (L,)`: the list before each, −1: none.
     """
     out = np.full(len(x_m), -1)
-    taken = np.zeros(len(x_m), dtype=np.bool_)
+    is_taken = np.zeros(len(x_m), dtype=np.bool_)
     for k in range(len(follows)):
         if follows[k] < 0:
             continue
         a, b = begin[follows[k]], begin[follows[k] + 1]
         for e in range(begin[k], begin[k + 1]):
             for p in range(a, b):
-                if ids[e] >= 0 and ids[e] == ids[p] and not taken[p]:
-                    out[e], taken[p] = p, True
+                if ids[e] >= 0 and ids[e] == ids[p] and not is_taken[p]:
+                    out[e], is_taken[p] = p, True
                     break
         while True:
-            best, one, other = gate_m * gate_m, -1, -1
+            best, entry, previous = gate_m * gate_m, -1, -1
             for e in range(begin[k], begin[k + 1]):
                 if out[e] < 0:
                     for p in range(a, b):
                         far = (x_m[e] - x_m[p]) ** 2 + (y_m[e] - y_m[p]) ** 2
-                        if not taken[p] and far < best:
-                            best, one, other = far, e, p
-            if one < 0:
+                        if not is_taken[p] and far < best:
+                            best, entry, previous = far, e, p
+            if entry < 0:
                 break
-            out[one], taken[other] = other, True
+            out[entry], is_taken[previous] = previous, True
     return out
 
 
@@ -80,7 +80,7 @@ def garwood_interval(count: float) -> tuple[float, float]:
     return (float(chi2.ppf(0.025, 2 * count) / 2) if count else 0.0), float(chi2.ppf(0.975, 2 * count + 2) / 2)
 
 
-def estimate_duration(stayed_s: Float, ended_s: Float, what: str) -> Estimate:
+def estimate_duration(stayed_s: Float, ended_s: Float, event: str) -> Estimate:
     """The mean duration τ (s) by maximum likelihood, of gaps over which it stayed and gaps in which it ended.
 
     The interval is that of the number of ends. Without an end only a lower limit can be told.
@@ -90,7 +90,7 @@ def estimate_duration(stayed_s: Float, ended_s: Float, what: str) -> Estimate:
     n, ends, total_s = len(stayed_s) + len(ended_s), len(ended_s), float(stayed_s.sum() + ended_s.sum())
     low, high = garwood_interval(ends)
     if not ends or not len(stayed_s):
-        why = f"no {what} in {total_s:.3g} s" if not ends else f"{what} at every list"
+        why = f"no {event} in {total_s:.3g} s" if not ends else f"{event} at every list"
         return Estimate(float("nan"), total_s / high if not ends else 0.0, float("inf"), n, ends, why)
 
     def slope(log_tau: float) -> float:
@@ -123,7 +123,7 @@ class GhostSort:
     classes: dict[str, float]
 
     def keys(self) -> dict[str, Any]:
-        """One of a PEM's `ghosts`."""
+        """The sort as an item of a PEM's `ghosts`."""
         lasts_s = self.lasts_s
         return {
             "in_list": self.in_list.written(),

@@ -82,7 +82,7 @@ def find_moved(main: Any, others: Mapping[float, Any]) -> list[str]:
 
 
 def to_plain_data(part: Any) -> Any:
-    """Anything a fit holds as plain data for JSON; NaN and infinity as null."""
+    """Any content of a fit as plain data for JSON; NaN and infinity as null."""
     if isinstance(part, float | np.floating):
         return float(part) if math.isfinite(part) else None
     if isinstance(part, np.ndarray):
@@ -144,24 +144,24 @@ class ReplayChecks:
         """Whether any statistic is too often outside of what the model gives."""
         return any(self.refuses(one) for one in self.fitted)
 
-    def refuses(self, one: StatisticCheck) -> bool:
+    def refuses(self, check: StatisticCheck) -> bool:
         """Whether a statistic contradicts the model, at a level that as many share (Bonferroni)."""
-        return one.verdict == "too sure" and one.p * one.among < SURE
+        return check.verdict == "too sure" and check.p * check.among < SURE
 
     def lines(self) -> Iterator[str]:
         """A line per statistic."""
-        fresh = {one.statistic: one for one in self.memoryless}
+        memoryless_checks = {check.statistic: check for check in self.memoryless}
         where = "logs held out" if self.held_out else "the logs it was fitted to"
-        for one in self.fitted:
-            line = f"replay check on {where}, {one.statistic}: {_format_verdict(one)}"
-            memoryless = fresh.get(one.statistic)
+        for check in self.fitted:
+            line = f"replay check on {where}, {check.statistic}: {_format_verdict(check)}"
+            memoryless = memoryless_checks.get(check.statistic)
             yield line if memoryless is None else f"{line}; without memory: {_format_verdict(memoryless)}"
 
 
-def _format_verdict(one: StatisticCheck) -> str:
-    if one.statistic in TOTALS:
-        return f"{one.verdict} (all passes, p {one.p:.2g})"
-    return f"{one.verdict} ({one.inside} of {count_noun(len(one.pit), 'pass', 'passes')} inside 95 %, p {one.p:.2g})"
+def _format_verdict(c: StatisticCheck) -> str:
+    if c.statistic in TOTALS:
+        return f"{c.verdict} (all passes, p {c.p:.2g})"
+    return f"{c.verdict} ({c.inside} of {count_noun(len(c.pit), 'pass', 'passes')} inside 95 %, p {c.p:.2g})"
 
 
 @dataclass(frozen=True)
@@ -186,17 +186,19 @@ class Fit:
     @property
     def said(self) -> tuple[str, ...]:
         """All notes: on the data, on detection, and on estimates that another gate moves."""
-        more = [f"detection: {line}" for line in self.parts.detection.notes]
-        more += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
+        notes = [f"detection: {line}" for line in self.parts.detection.notes]
+        notes += [f"no memory of detection: {why}" for why in (self.parts.detection.memory_why,) if why is not None]
         between, shape = self.parts.errors.between_logs, self.parts.errors.shape
-        more += [f"errors: {shape.words()}"] if shape.heavier else []
-        more += [f"errors that differ between logs: {between.untold}"] if between is not None and between.untold else []
-        more += [f"another gate: {line}" for line in self.gates]
-        return (*self.notes, *more)
+        notes += [f"errors: {shape.words()}"] if shape.heavier else []
+        notes += (
+            [f"errors that differ between logs: {between.untold}"] if between is not None and between.untold else []
+        )
+        notes += [f"another gate: {line}" for line in self.gates]
+        return (*self.notes, *notes)
 
 
 def judge_use(fit: Fit) -> str:
-    """What the model may be used for and what not, in one sentence."""
+    """One sentence on what the model may be used for, and what not."""
     low_m, high_m = fit.gathered.reach.range_m
     rows = fit.gathered.rows
     classes, count = np.unique(rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]], return_counts=True)
@@ -206,11 +208,11 @@ def judge_use(fit: Fit) -> str:
     where = f"{', '.join(many or passes)} at {low_m:g} to {high_m:g} m"
     if fit.checks is None:
         return f"Use it for nothing yet ({where}): it was not replayed beside the recording."
-    wrong = [one.statistic for one in fit.checks.fitted if fit.checks.refuses(one)]
+    wrong = [check.statistic for check in fit.checks.fitted if fit.checks.refuses(check)]
     if wrong:
         return f"Do not use it for results: replays of it differ from the recording ({where}) in {'; '.join(wrong)}."
-    if all(one.verdict == "too few passes to tell" for one in fit.checks.fitted):
-        most = count_noun(max((len(one.pit) for one in fit.checks.fitted), default=0), "pass", "passes")
+    if all(check.verdict == "too few passes to tell" for check in fit.checks.fitted):
+        most = count_noun(max((len(check.pit) for check in fit.checks.fitted), default=0), "pass", "passes")
         why = f"{most} cannot tell whether it behaves like the recording, {FEWEST_PASSES} could"
         return f"Use it to try an experiment out ({where}), not for results: {why}."
     known = "" if fit.checks.held_out else ", which it knows already (--hold-out)"
@@ -223,7 +225,7 @@ def judge_use(fit: Fit) -> str:
 
 
 def preview_fit(experiment: Experiment, recordings: Sequence[Recording], unit: str) -> tuple[str, ...]:
-    """What a fit of the recorded unit would say of its place, its delay, and its matches with the truth."""
+    """Lines on the unit's place, its delay, and its matches with the truth, as a fit would find them."""
     label = f"copem-replay fit --unit {unit}"
     try:
         check_unit(experiment, unit)
@@ -267,13 +269,13 @@ def fit_unit(experiment: Experiment, recordings: Sequence[Recording], unit: str,
         )
         for share in (_GATES if how.other_gates else ())
     }  # fmt: skip
-    held = None
+    unseen = None
     if held_out:
         held_views = _view_logs(held_out, experiment, unit, delay)
-        held = gather_rows(held_views, gate_m=gate_m, max_gap_s=max_gap_s, reach=gathered.reach)
+        unseen = gather_rows(held_views, gate_m=gate_m, max_gap_s=max_gap_s, reach=gathered.reach)
     return Fit(
         unit, tuple(r.scene.log for r in fitted), tuple(r.scene.log for r in held_out), how, truth, delay,
-        _invert_period(parts.rest.list_times.period_s), parts, gathered, held, tuple(find_moved(parts, other_gates)),
+        _invert_period(parts.rest.list_times.period_s), parts, gathered, unseen, tuple(find_moved(parts, other_gates)),
         (*delay.notes, *_note_data(gathered, truth, how)),
     )  # fmt: skip
 
@@ -471,15 +473,15 @@ def _build_log_entry(entry: Any, fit: Fit, log: str, names: tuple[str, str], sta
     units, own_s = dict(settings.get("units") or {}), fit.delay.of_log.get(log)
     if names[0] not in units and own_s is None:
         return entry
-    asked = names[0] in units
-    given = units.pop(names[0], {})
-    if given is None:
+    has_settings = names[0] in units
+    own_settings = units.pop(names[0], {})
+    if own_settings is None:
         return settings | {"units": units | dict.fromkeys(reversed(names))}
     stated = stated if own_s is None else stated | {"delay_s": max(round_digits(own_s, 6), 0.0)}
-    lists = given.get("recorded") or (recorded if own_s is not None else None)
-    other = given | ({} if lists is None else {"recorded": _complete_recorded(lists, stated)})
-    fitted = {key: value for key, value in given.items() if key != "recorded"}
-    return settings | {"units": units | {names[1]: other} | ({names[0]: fitted} if asked and fitted else {})}
+    lists = own_settings.get("recorded") or (recorded if own_s is not None else None)
+    other = own_settings | ({} if lists is None else {"recorded": _complete_recorded(lists, stated)})
+    fitted = {key: value for key, value in own_settings.items() if key != "recorded"}
+    return settings | {"units": units | {names[1]: other} | ({names[0]: fitted} if has_settings and fitted else {})}
 
 
 # The replay check.
@@ -492,8 +494,8 @@ def add_replay_check(fit: Fit, *, seed: int = 0) -> Fit:
     keys = fit.parts.rest.placed.keys()
     placed = PoseError.model_validate(strip_comments(keys)) if keys else None
     with_memory = replay_check(pem, gathered.rows, gathered.lists, placed=placed, seed=seed)
-    fresh: tuple[StatisticCheck, ...] = ()
+    memoryless: tuple[StatisticCheck, ...] = ()
     if pem.remembers:
         always_new = None if placed is None else placed.model_copy(update={"memory": None})
-        fresh = replay_check(remove_memory(pem), gathered.rows, gathered.lists, placed=always_new, seed=seed)
-    return replace(fit, checks=ReplayChecks(fit.held is not None, with_memory, fresh))
+        memoryless = replay_check(remove_memory(pem), gathered.rows, gathered.lists, placed=always_new, seed=seed)
+    return replace(fit, checks=ReplayChecks(fit.held is not None, with_memory, memoryless))

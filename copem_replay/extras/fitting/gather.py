@@ -78,15 +78,15 @@ def raw_lists(recordings: Sequence[Recording], experiment: Experiment, name: str
     return lists
 
 
-def view_log(recording: Recording, found: RecordedLists, experiment: Experiment, name: str, delay_s: float) -> LogView:
+def view_log(recording: Recording, lists: RecordedLists, experiment: Experiment, name: str, delay_s: float) -> LogView:
     """A log as its unit sees it. Lists that do not state their capture were captured `delay_s` before their stamps."""
     resolved = resolve_for_log(experiment, recording.scene.log)
     unit, scene = check_unit(resolved, name), recording.scene
-    found = shift_captures(found, scene, delay_s)
+    lists = shift_captures(lists, scene, delay_s)
     truth = interpolate_at_instants(
         recording.truth, recording.truth.stamp_ns, t0_ns=scene.t0_ns, max_gap_s=resolved.max_gap_s
     )
-    stamps, of_frame = np.unique(found.tracks.stamp_ns, return_inverse=True)
+    stamps, of_frame = np.unique(lists.tracks.stamp_ns, return_inverse=True)
     world = interpolate_at_instants(truth, stamps, t0_ns=scene.t0_ns, max_gap_s=resolved.max_gap_s)
     carrier_ix = find_carrier(scene, unit)
     host = world.take_tracks(world.object_ix == carrier_ix)
@@ -104,11 +104,11 @@ def view_log(recording: Recording, found: RecordedLists, experiment: Experiment,
     order = order[poses.present[of_frame[order]]]
     place_of = np.full(len(of_frame), -1)
     place_of[order] = np.arange(len(order))
-    at = of_frame[order]
-    row, list_ix = _repeat_by_list(states, np.flatnonzero(poses.present), at)
+    f = of_frame[order]
+    row, list_ix = _repeat_by_list(states, np.flatnonzero(poses.present), f)
     return LogView(
-        scene, truth, found, place_of, (stamps[at] - scene.t0_ns) * np.float64(1e-9), poses.x_m[at], poses.y_m[at],
-        poses.heading_rad[at], carrier_ix, list_ix, states, row, view,
+        scene, truth, lists, place_of, (stamps[f] - scene.t0_ns) * np.float64(1e-9), poses.x_m[f], poses.y_m[f],
+        poses.heading_rad[f], carrier_ix, list_ix, states, row, view,
     )  # fmt: skip
 
 
@@ -147,12 +147,12 @@ class FitReach:
     def holds(self, view: ViewGeometry) -> Bool:
         """(P,) which objects are within reach."""
         low_m, high_m = self.range_m
-        inside: Bool = (view.range_m >= low_m) & (view.range_m <= high_m)
+        is_within: Bool = (view.range_m >= low_m) & (view.range_m <= high_m)
         if self.azimuth_deg is not None:
             first, last = self.azimuth_deg
             turned = np.mod(np.degrees(view.azimuth_rad) - first, 360.0)
-            inside &= turned <= np.mod(last - first, 360.0)
-        return inside
+            is_within &= turned <= np.mod(last - first, 360.0)
+        return is_within
 
 
 def find_reach(view: ViewGeometry, listed: Bool) -> FitReach | None:
@@ -199,12 +199,12 @@ def assign_folds(pass_ix: Int, log: Int, folds: int | None) -> Int:
     """(R,) the fold of each row: whole logs where there are as many, else whole passes; all 0 of too few passes."""
     logs, which_log = np.unique(log, return_inverse=True)
     number = int(pass_ix[-1]) + 1 if len(pass_ix) else 0
-    asked = folds or FOLDS
-    if len(logs) >= asked:
-        return np.asarray(which_log % asked, dtype=np.int64)
+    n_folds = folds or FOLDS
+    if len(logs) >= n_folds:
+        return np.asarray(which_log % n_folds, dtype=np.int64)
     if number < FEWEST_PASSES:
         return np.zeros(len(pass_ix), dtype=np.int64)
-    return pass_ix % min(asked, number)
+    return pass_ix % min(n_folds, number)
 
 
 # Matching the lists with the truth.
@@ -258,7 +258,7 @@ def gather_rows(
     pieces = [_match_log(k, view, (gate_m, max_gap_s), ellipse_m) for k, view in enumerate(views)]
     first_list = np.cumsum([0, *(len(view.captured_s) for view in views)])
     columns = {key: np.concatenate([p.rows[key] for p in pieces], axis=-1) for key in pieces[0].rows}
-    others = {key: np.concatenate([p.others[key] for p in pieces]) for key in pieces[0].others}
+    other_columns = {key: np.concatenate([p.others[key] for p in pieces]) for key in pieces[0].others}
     view_of_rows = ViewGeometry(
         **{
             f: np.concatenate([getattr(view.view, f)[view.row] for view in views])
@@ -267,7 +267,7 @@ def gather_rows(
     )
     log = columns["log"]
     columns["list"] += first_list[log]
-    others["list"] += first_list[others["log"]]
+    other_columns["list"] += first_list[other_columns["log"]]
     entries = np.concatenate([piece.entries for piece in pieces])
     where = ("captured_s", "east_m", "north_m", "heading_rad")
     lists = FitLists(
@@ -283,21 +283,21 @@ def gather_rows(
             f"only {matched} {of_unit} are {near}: too few to fit" if matched
             else f"nothing {of_unit} is {near} at any delay up to {LONGEST_S:g} s: other frame, or other clock?"
         )  # fmt: skip
-    inside = np.flatnonzero(reach.holds(view_of_rows))
-    columns = {key: column[..., inside] for key, column in columns.items()}
+    rows_in_reach = np.flatnonzero(reach.holds(view_of_rows))
+    columns = {key: column[..., rows_in_reach] for key, column in columns.items()}
     away_m = columns.pop("away_m")
     notes = [line for name in ("yaw_rad", "speed_mps", "size_m") for line in _remove_outliers(name, columns[name])]
     pass_ix = number_passes(columns["log"], columns["object"], columns["list"])
     state_m = np.stack([columns.pop("x_m"), columns.pop("y_m")], axis=1)
     rows = FitRows(
-        **columns, pass_ix=pass_ix, view=view_of_rows.take(inside), state_m=state_m,
+        **columns, pass_ix=pass_ix, view=view_of_rows.take(rows_in_reach), state_m=state_m,
         fold=assign_folds(pass_ix, columns["log"], folds),
     )  # fmt: skip
     matched = int(rows.listed.sum())
     rows_in_list = np.bincount(rows.list, minlength=len(entries))
-    crowded = bool((np.bincount(others["list"], minlength=len(entries)) > rows_in_list).any())
+    crowded = bool((np.bincount(other_columns["list"], minlength=len(entries)) > rows_in_list).any())
     beyond = float((away_m[rows.listed] > _NEAR_GATE * gate_m).mean()) if matched else 0.0
-    return Gathered(lists, rows, OtherEntries(**others), reach, matched, beyond, crowded, tuple(notes))
+    return Gathered(lists, rows, OtherEntries(**other_columns), reach, matched, beyond, crowded, tuple(notes))
 
 
 def _remove_outliers(name: str, values: Float) -> Iterator[str]:
@@ -333,49 +333,49 @@ def _ellipse_m(pieces: Sequence[_MatchedLog]) -> Float:
 
 def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m: Float) -> _MatchedLog:
     gate_m, max_gap_s = gates
-    found, scene, L = view.found, view.scene, len(view.captured_s)
+    lists, scene, L = view.found, view.scene, len(view.captured_s)
     # To a unit the ego is an object like any other.
     assigned = assign_truth_ids(
-        found, replace(scene, ego_ix=-1), view.truth, gate_m=gate_m, max_gap_s=max_gap_s, confused=_CONFUSED
+        lists, replace(scene, ego_ix=-1), view.truth, gate_m=gate_m, max_gap_s=max_gap_s, confused=_CONFUSED
     )
     object_ix, list_of = assigned.row_object_ix.copy(), view.place_of[assigned.frame_ix]
-    within = list_of >= 0
-    kind = found.class_probability.argmax(axis=1)
-    entries = np.bincount(list_of[within], minlength=L)
+    is_in_list = list_of >= 0
+    kind = lists.class_probability.argmax(axis=1)
+    entries = np.bincount(list_of[is_in_list], minlength=L)
     class_ix = kind if (kind != _OTHER).any() else np.full(len(kind), -1)
-    fields = {"class_ix": class_ix, "existence": found.existence, "track_id": found.track_id}
+    fields = {"class_ix": class_ix, "existence": lists.existence, "track_id": lists.track_id}
     R, objects = len(view.row), len(scene.object_ids)
     row_object = view.states.row_object_ix[view.row]
     key = view.list_ix * objects + row_object
     by_key = np.argsort(key)
-    matched = np.flatnonzero(within & (object_ix >= 0) & (object_ix != view.carrier_ix))
+    matched = np.flatnonzero(is_in_list & (object_ix >= 0) & (object_ix != view.carrier_ix))
     rows_of_matched = by_key[np.searchsorted(key[by_key], list_of[matched] * objects + object_ix[matched])]
     entry = np.full(R, -1)
     entry[rows_of_matched] = matched
-    errors = _error_columns(view, found, entry)
-    far = np.hypot(errors["along_m"] / ellipse_m[0], errors["across_m"] / ellipse_m[1]) > 1
-    object_ix[entry[far]] = entry[far] = -1
+    errors = _error_columns(view, lists, entry)
+    is_far = np.hypot(errors["along_m"] / ellipse_m[0], errors["across_m"] / ellipse_m[1]) > 1
+    object_ix[entry[is_far]] = entry[is_far] = -1
     listed = entry >= 0
     places = np.stack([errors["x_m"], errors["y_m"], view.list_ix * _APART_M], axis=1)
     # An entry near several true objects of a list may be about either.
-    apart = cKDTree(places).query(places, k=2)[0][:, 1] > min(gate_m, float(ellipse_m.max()))
+    is_apart = cKDTree(places).query(places, k=2)[0][:, 1] > min(gate_m, float(ellipse_m.max()))
     for name in ("along_m", "across_m", "east_m", "north_m", "yaw_rad", "speed_mps", "size_m"):
-        errors[name][..., ~apart | far] = np.nan
+        errors[name][..., ~is_apart | is_far] = np.nan
     rows: dict[str, Any] = {
         "list": view.list_ix.copy(), "log": np.full(R, number), "object": row_object,
         "captured_s": view.captured_s[view.list_ix], "listed": listed,
-        "apart": apart,
+        "apart": is_apart,
         **errors,
         **{name: np.where(listed, of[entry], np.nan if of.dtype.kind == "f" else -1) for name, of in fields.items()},
     }  # fmt: skip
-    other = np.flatnonzero(within & (object_ix < 0))
+    other = np.flatnonzero(is_in_list & (object_ix < 0))
     other = other[np.argsort(list_of[other], kind="stable")]
     return _MatchedLog(rows, _other_columns(number, view, other, list_of[other], rows, fields), entries)
 
 
-def _error_columns(view: LogView, found: RecordedLists, entry: Int) -> dict[str, Any]:
+def _error_columns(view: LogView, lists: RecordedLists, entry: Int) -> dict[str, Any]:
     """Entry minus truth of rows (R,), NaN where not listed, or where no entry of the log has the field."""
-    tracks, listed = found.tracks, entry >= 0
+    tracks, listed = lists.tracks, entry >= 0
 
     def listed_value(name: str) -> Float:
         column = getattr(tracks, name)[0]
@@ -413,9 +413,9 @@ def _other_columns(
     tracks = view.found.tracks
     east, north = tracks.x_m[0, other], tracks.y_m[0, other]
     places = np.stack([rows["x_m"], rows["y_m"], view.list_ix * _APART_M], axis=1)
-    wanted = np.stack([east, north, list_ix * _APART_M], axis=1)
-    if len(places) and len(wanted):
-        nearest_m, nearest = cKDTree(places).query(wanted)
+    entry_places = np.stack([east, north, list_ix * _APART_M], axis=1)
+    if len(places) and len(entry_places):
+        nearest_m, nearest = cKDTree(places).query(entry_places)
     else:
         nearest_m, nearest = np.full(len(other), np.inf), np.zeros(len(other), dtype=np.int64)
     nearest_class = view.view.class_ix[view.row][nearest] if len(places) else np.full(len(other), -1)

@@ -36,7 +36,7 @@ _STRENGTHS = np.geomspace(4, 1e5, 60)
 
 @dataclass(frozen=True)
 class RangeBin:
-    """Where one covariance holds: an interval of range, and of visible share and a class where bins are split by it."""
+    """The area of one covariance: an interval of range, and of visible share and class where bins are split by it."""
 
     range_m: tuple[float, float]
     visible_share: tuple[float, float] | None = None
@@ -44,14 +44,14 @@ class RangeBin:
 
     @property
     def when(self) -> dict[str, Any]:
-        """The condition of a couple."""
+        """The area as the condition of a couple."""
         when: dict[str, Any] = {"range_m": list(self.range_m)}
         when |= {} if self.visible_share is None else {"visible_share": list(self.visible_share)}
         return when if self.of_class is None else when | {"classes": [self.of_class]}
 
     @property
     def words(self) -> str:
-        """Where it holds, in words."""
+        """The area in words."""
         low_m, high_m = self.range_m
         shares = "" if self.visible_share is None else ", visible share {:g} to {:g}".format(*self.visible_share)
         return f"{low_m:g} to {high_m:g} m{shares}{'' if self.of_class is None else f', {self.of_class}'}"
@@ -119,11 +119,11 @@ def share_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> 
 def class_bins(bins: tuple[RangeBin, ...], view: ViewGeometry, worth: float) -> tuple[RangeBin, ...]:
     """Bins split by class; classes of fewer than CLASS_ROWS effective rows stay together, in bins behind the others."""
     kinds, n = np.unique(view.class_ix, return_counts=True)
-    apart = [CLASSES[k] for k in kinds[n * worth >= CLASS_ROWS].tolist()]
-    if not apart or len(kinds) < 2:
+    single_classes = [CLASSES[k] for k in kinds[n * worth >= CLASS_ROWS].tolist()]
+    if not single_classes or len(kinds) < 2:
         return bins
-    split = tuple(replace(one, of_class=kind) for kind in apart for one in bins)
-    return split if len(apart) == len(kinds) else (*split, *bins)
+    split = tuple(replace(one, of_class=kind) for kind in single_classes for one in bins)
+    return split if len(single_classes) == len(kinds) else (*split, *bins)
 
 
 def find_bin(view: ViewGeometry, bins: tuple[RangeBin, ...]) -> Int:
@@ -152,23 +152,23 @@ def fit_moments(
     bins = len(where)
     n = np.bincount(bin_ix, minlength=bins)
     sums = sum_correlations(series.decay(shares.tau_s), series.new, bin_ix, bins, shares.drift, shares.constant)
-    once, twice = np.maximum(sums, 1.0)
+    sum_rho, sum_rho2 = np.maximum(sums, 1.0)
     mean = np.repeat(error_m.mean(axis=0)[None], bins, axis=0)
     moments = np.zeros((bins, 2, 2))
     freedom, half_width_m, passes = np.full((bins, 2), 1e-3), np.full((bins, 2), np.inf), np.zeros(bins, dtype=np.int64)
     series_ix = np.cumsum(series.new) - 1
-    of_mean = np.minimum(once / np.maximum(n, 1) ** 2, 0.9)
+    of_mean = np.minimum(sum_rho / np.maximum(n, 1) ** 2, 0.9)
     for b in np.flatnonzero(n).tolist():
         rows = np.flatnonzero(bin_ix == b)
         new = np.diff(series_ix[rows], prepend=-1) != 0
         mean[b] = error_m[rows].mean(axis=0)
-        rest, passes[b] = error_m[rows] - mean[b], int(new.sum())
-        moments[b] = rest.T @ rest / max(n[b] * (1 - of_mean[b]), 1.0)
+        residuals, passes[b] = error_m[rows] - mean[b], int(new.sum())
+        moments[b] = residuals.T @ residuals / max(n[b] * (1 - of_mean[b]), 1.0)
         for k in range(2):
-            phi = lag_one_correlation(rest[:, k], new)
+            phi = lag_one_correlation(residuals[:, k], new)
             neighbours = n[b] * (1 - phi**2) / (1 + phi**2)
-            freedom[b, k] = max(min(n[b] ** 2 / twice[b] * (1 - of_mean[b]), neighbours), 1e-3)
-            half_width_m[b, k] = mean_half_width(rest[:, k], new, phi, float(moments[b, k, k]))
+            freedom[b, k] = max(min(n[b] ** 2 / sum_rho2[b] * (1 - of_mean[b]), neighbours), 1e-3)
+            half_width_m[b, k] = mean_half_width(residuals[:, k], new, phi, float(moments[b, k, k]))
     for kind in {one.of_class: None for one in where}:
         alike = np.flatnonzero([one.of_class == kind for one in where])
         least = freedom[alike].min(axis=1)
@@ -177,16 +177,16 @@ def fit_moments(
     return Moments(mean, moments, n, passes, half_width_m, freedom)
 
 
-def lag_one_correlation(rest: Float, new: Bool) -> float:
+def lag_one_correlation(residuals: Float, new: Bool) -> float:
     """φ of an autoregression, from residuals (n,) about a common mean; `new (n,)`: where a pass begins. 0 to 0.9999.
 
     Too small by (1 + 4φ)/n on average, which is added (F. H. C. Marriott, J. A. Pope, Biometrika 41 (1954) 390–402).
     """
-    n, pairs = len(rest), int((~new[1:]).sum())
-    whole = float(rest @ rest)
-    if not pairs or whole == 0:
+    n, pairs = len(residuals), int((~new[1:]).sum())
+    total = float(residuals @ residuals)
+    if not pairs or total == 0:
         return 0.0
-    phi = float((rest[1:] * rest[:-1])[~new[1:]].sum()) / pairs / (whole / n)
+    phi = float((residuals[1:] * residuals[:-1])[~new[1:]].sum()) / pairs / (total / n)
     return float(np.clip(phi + (1 + 4 * phi) / n, 0.0, 0.9999))
 
 
@@ -202,24 +202,24 @@ def _sum_autoregression(phi: float, lengths: Int) -> Float:
     return out
 
 
-def mean_half_width(rest: Float, new: Bool, phi: float, variance: float) -> float:
+def mean_half_width(residuals: Float, new: Bool, phi: float, variance: float) -> float:
     """Half the width of the 95 % interval of a mean, from residuals (n,) about it; `new (n,)`: where a pass begins.
 
     By passes: V = Σ e²/(1 − w/n)/n² over the passes' sums e of w rows, with the degrees of freedom (tr Q)²/tr Q² that
     V has if rows are an autoregression of φ (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (2002) 169–181).
     """
-    n, w = len(rest), np.diff(np.append(np.flatnonzero(new), len(rest)))
+    n, w = len(residuals), np.diff(np.append(np.flatnonzero(new), len(residuals)))
     effective = count_effective(phi, w)
     half = float(t.ppf(0.975, max(effective - 1, 0.5)) * np.sqrt(variance / effective))
     if len(w) == 1:
         return half
-    each = np.add.reduceat(rest, np.flatnonzero(new))
+    pass_sums = np.add.reduceat(residuals, np.flatnonzero(new))
     scale = 1 / (1 - w / n)
     spread = np.eye(len(w)) - np.outer(w, np.ones(len(w))) / n
     root = np.sqrt(scale)[:, None] * spread
     q = root * _sum_autoregression(phi, w) @ root.T
     freedom = float(np.trace(q) ** 2 / (q * q).sum())
-    by_passes = float(t.ppf(0.975, freedom) * np.sqrt((each**2 * scale).sum()) / n)
+    by_passes = float(t.ppf(0.975, freedom) * np.sqrt((pass_sums**2 * scale).sum()) / n)
     return by_passes if len(w) >= PASSES_ALONE else max(by_passes, half)
 
 
@@ -271,7 +271,7 @@ def fit_between_logs(rest_m: Float, log: Int, series: ResidualSeries, shares: Me
     if K < FEWEST_LOGS:
         return None
     n = np.bincount(log_ix)
-    once, _ = sum_correlations(series.decay(shares.tau_s), series.new, log_ix, K, shares.drift, shares.constant)
+    sum_rho, _ = sum_correlations(series.decay(shares.tau_s), series.new, log_ix, K, shares.drift, shares.constant)
     lengths = np.diff(np.append(np.flatnonzero(series.new), len(log)))
     log_of_pass = log_ix[series.new]
     pools, variances = [], (rest_m**2).mean(axis=0)
@@ -279,7 +279,7 @@ def fit_between_logs(rest_m: Float, log: Int, series: ResidualSeries, shares: Me
         phi = lag_one_correlation(rest_m[:, k], series.new)
         alone = np.array([1 / count_effective(phi, lengths[log_of_pass == g]) for g in range(K)])
         means = np.bincount(log_ix, rest_m[:, k]) / n
-        pools.append(pool_logs(means, variances[k] * np.maximum(once / n**2, alone), len(log)))
+        pools.append(pool_logs(means, variances[k] * np.maximum(sum_rho / n**2, alone), len(log)))
     sigmas = pools[0].between, pools[1].between
     share = float(min((sigmas[0].value ** 2 + sigmas[1].value ** 2) / variances.sum(), 1.0))
     untold = None
@@ -310,7 +310,7 @@ def estimate_bin(where: RangeBin, moments: Moments, b: int) -> ErrorBin:
     """The numbers of bin b with their intervals."""
     (xx, xy), (_, yy) = moments.covariance_m2[b]
     n, freedom = int(moments.n[b]), moments.freedom[b]
-    means = [
+    mean_estimates = [
         Estimate(
             float(value), float(value - half), float(value + half), n, min(float(variance * (1.96 / half) ** 2), n)
         )
@@ -318,11 +318,11 @@ def estimate_bin(where: RangeBin, moments: Moments, b: int) -> ErrorBin:
     ]
     least = float(freedom.min())
     half_m2 = float(t.ppf(0.975, max(least, 1.0)) * np.sqrt((xx * yy + xy**2) / least))
-    between = Estimate(float(xy), float(xy - half_m2), float(xy + half_m2), n, least)
+    covariance = Estimate(float(xy), float(xy - half_m2), float(xy + half_m2), n, least)
     return ErrorBin(
         where,
-        (means[0], means[1]),
-        (estimate_variance(xx, n, float(freedom[0])), between, estimate_variance(yy, n, float(freedom[1]))),
+        (mean_estimates[0], mean_estimates[1]),
+        (estimate_variance(xx, n, float(freedom[0])), covariance, estimate_variance(yy, n, float(freedom[1]))),
     )
 
 

@@ -37,34 +37,34 @@ class NeedlessCheck:
         """As a line of the fit's table."""
         if self.why:
             return f"braking for nothing on logs held out: not known: {self.why}"
-        told = [
+        parts = [
             f"{name} {100 * share:.2g} % of the time, {per_h:.3g} an hour"
             + ("" if ghosts is None else f", {100 * ghosts:.0f} % for ghosts")
             for name, share, per_h, ghosts in zip(
                 ("recorded", "fitted"), self.share, self.per_h, self.ghosts, strict=True
             )
         ]
-        return f"braking for nothing on logs held out, {self.driving_s:.3g} s of driving: {'; '.join(told)}"
+        return f"braking for nothing on logs held out, {self.driving_s:.3g} s of driving: {'; '.join(parts)}"
 
 
 def check_needless(fit: Fit, experiment: Experiment, recordings: Sequence[Recording]) -> NeedlessCheck | None:
     """The check on the logs that are held out; None: there are none."""
     from copem_replay.api.run import run
 
-    held = [recording for recording in recordings if recording.scene.log in fit.held_out]
-    if not held:
+    held_logs = [recording for recording in recordings if recording.scene.log in fit.held_out]
+    if not held_logs:
         return None
-    if any(recording.scene.ego_ix < 0 or not recording.scene.ego_sized for recording in held):
+    if any(recording.scene.ego_ix < 0 or not recording.scene.ego_sized for recording in held_logs):
         return NeedlessCheck("no ego, or its size is not known")
-    if not all(recording.lists[fit.unit].velocity_said for recording in held):
+    if not all(recording.lists[fit.unit].velocity_said for recording in held_logs):
         return NeedlessCheck("its lists state no velocity")
     settings = [entry for entry in experiment.logs if isinstance(entry, str) or entry.name in fit.held_out]
-    data = build_experiment(fit, experiment, log_entries(settings, held, Path()))
+    data = build_experiment(fit, experiment, log_entries(settings, held_logs, Path()))
     configurations = {name: of | {"fusion": {"kind": "union"}} for name, of in data["configurations"].items()}
     braking: Any = {"driver": R157} if experiment.braking is None else data["braking"] | {"needless": {}}
     measure = data["measure"] | {"accuracy": True, "exact": False, "metrics": [], "by": []}
-    more = {"runs": _RUNS, "show": None, "criteria": {}, "braking": braking, "measure": measure}
-    results = run({**data, **more, "configurations": configurations})
+    overrides = {"runs": _RUNS, "show": None, "criteria": {}, "braking": braking, "measure": measure}
+    results = run({**data, **overrides, "configurations": configurations})
     summary = results.summary.set_index("configuration").loc[["recorded", "fitted"]]
     if not summary["driving_h"].max() > 0:
         return NeedlessCheck("the ego does not drive")

@@ -94,19 +94,19 @@ def _estimates_table(fit: Fit) -> Html:
         make_tag(
             "tr",
             make_tag("th", allow_breaks(describe_name(fit, name)), scope="row"),
-            *(make_tag("td", "–" if "nan" in shown else shown.replace("-", "−")) for shown in one.shown()),
-            make_tag("td", str(one.n) if one.n else "–"),
-            make_tag("td", format_three_digits(one.n_effective) if one.n_effective > 0 else "–"),
-            make_tag("td", one.why or ("chosen" if one.chosen else ""), class_="text"),
+            *(make_tag("td", "–" if "nan" in shown else shown.replace("-", "−")) for shown in estimate.shown()),
+            make_tag("td", str(estimate.n) if estimate.n else "–"),
+            make_tag("td", format_three_digits(estimate.n_effective) if estimate.n_effective > 0 else "–"),
+            make_tag("td", estimate.why or ("chosen" if estimate.chosen else ""), class_="text"),
         )
-        for name, one in list_estimates(fit)
+        for name, estimate in list_estimates(fit)
     ]
     head = ("number", "estimate", "95 %", "n", "effective n", "not identifiable")
     return make_table(head, rows, caption="Every number with its interval", id_="numbers")
 
 
 def _list_ladders(fit: Fit) -> dict[str, Sequence[Rung]]:
-    """The models that were compared, by what they are of."""
+    """The compared models, by the quantity they describe."""
     errors = fit.parts.errors
     return {"detection": fit.parts.detection.ladder, "errors": errors.ladder, "frame of errors": errors.frames}
 
@@ -121,13 +121,13 @@ def _choice_tables(fit: Fit) -> Html:
         rows = [
             make_tag(
                 "tr",
-                make_tag("th", one.name, scope="row"),
-                make_tag("td", format_three_digits(one.score)),
-                make_tag("td", f"{one.below:.3g} ± {one.below_se:.2g}" if one.below else "–"),
-                make_tag("td", one.by, class_="text"),
-                make_tag("td", "chosen" if one.chosen else "", class_="text"),
+                make_tag("th", rung.name, scope="row"),
+                make_tag("td", format_three_digits(rung.score)),
+                make_tag("td", f"{rung.below:.3g} ± {rung.below_se:.2g}" if rung.below else "–"),
+                make_tag("td", rung.by, class_="text"),
+                make_tag("td", "chosen" if rung.chosen else "", class_="text"),
             )
-            for one in rungs
+            for rung in rungs
         ]
         head = ("model", "nats per list", "below the best", "scored by", "")
         parts.append(make_table(head, rows, caption=title.capitalize()))
@@ -356,28 +356,28 @@ def write_fit_places(path: Path, unit: str, logs: tuple[str, ...], rows: FitRows
             _send_log(out, plain_part(name), unit, in_order, lists, np.flatnonzero(lists.log == log))
 
 
-def _send_log(out: RecordingSink, log: str, unit: str, rows: FitRows, lists: FitLists, own: Int) -> None:
-    """Send what a log has, with rows list by list. `own`: its lists."""
+def _send_log(out: RecordingSink, log: str, unit: str, rows: FitRows, lists: FitLists, ix: Int) -> None:
+    """Send what a log has, with rows list by list. `ix`: its lists."""
     import rerun as rr
 
-    elapsed_ns = to_nanoseconds(lists.captured_s[own])
+    elapsed_ns = to_nanoseconds(lists.captured_s[ix])
 
-    def send(what: str, columns: Any, list_ix: Int, look: Any) -> None:
-        count = np.bincount(list_ix - own[0], minlength=len(own)) if len(own) else np.zeros(0, dtype=np.int64)
-        out.columns(["world", log, what], elapsed_ns, columns.partition(count))
-        out.static(["world", log, what], look)
+    def send(layer: str, columns: Any, list_ix: Int, look: Any) -> None:
+        count = np.bincount(list_ix - ix[0], minlength=len(ix)) if len(ix) else np.zeros(0, dtype=np.int64)
+        out.columns(["world", log, layer], elapsed_ns, columns.partition(count))
+        out.static(["world", log, layer], look)
 
-    for what, shown, colour, size in (("listed", rows.listed, LISTED, 3), ("missed", ~rows.listed, MISSED, 4)):
+    for layer, shown, colour, size in (("listed", rows.listed, LISTED, 3), ("missed", ~rows.listed, MISSED, 4)):
         points = rr.Points3D.columns(positions=_flat_positions(*rows.state_m[shown].T))
         look = rr.Points3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(size))
-        send(what, points, rows.list[shown], look)
+        send(layer, points, rows.list[shown], look)
     erring = rows.take(rows.listed & np.isfinite(rows.east_m))
     origins, vectors = _flat_positions(*erring.state_m.T), _flat_positions(erring.east_m, erring.north_m)
     arrows = rr.Arrows3D.columns(origins=origins, vectors=vectors)
     send("error", arrows, erring.list, rr.Arrows3D.from_fields(colors=[ERROR], radii=rr.Radius.ui_points(1)))
-    places = rr.Points3D.columns(positions=_flat_positions(lists.east_m[own], lists.north_m[own]))
+    places = rr.Points3D.columns(positions=_flat_positions(lists.east_m[ix], lists.north_m[ix]))
     mark = rr.Points3D.from_fields(colors=[UNIT], radii=rr.Radius.ui_points(7), labels=[unit], show_labels=True)
-    send("unit", places, own, mark)
+    send("unit", places, ix, mark)
 
 
 def _flat_positions(east_m: Float, north_m: Float) -> np.ndarray:

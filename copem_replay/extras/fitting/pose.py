@@ -54,9 +54,9 @@ class PoseFit:
 def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
     """Fit the pose error of a unit to listed rows. The mean of all rows is a bias of entries, not of the pose."""
     count = np.bincount(rows.list, minlength=len(lists.log))
-    enough = int((count >= 2).sum())
-    if enough < FEWEST_LISTS:
-        return PoseFit(untold=f"{enough} lists have two objects or more; a pose needs {FEWEST_LISTS}")
+    usable = int((count >= 2).sum())
+    if usable < FEWEST_LISTS:
+        return PoseFit(untold=f"{usable} lists have two objects or more; a pose needs {FEWEST_LISTS}")
     shared = rows.take(count[rows.list] >= 2)
     if (three := int((count >= 3).sum())) < FEWEST_LISTS:
         return PoseFit(untold=f"{three} lists have three objects: what two of them share need not be the unit's")
@@ -69,8 +69,8 @@ def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
 
     def pairs(column: Float) -> Float:
         """(L,) Σ over pairs of different objects in a list."""
-        whole: Float = (np.bincount(shared.list, column, L) ** 2 - np.bincount(shared.list, column**2, L)) / 2
-        return whole
+        pair_sum: Float = (np.bincount(shared.list, column, L) ** 2 - np.bincount(shared.list, column**2, L)) / 2
+        return pair_sum
 
     # Products along have l·l' of the shift, those across l·l' of the shift and r r' of the turn; l: lines of sight.
     a11 = 2 * (pairs(cos * cos) + 2 * pairs(cos * sin) + pairs(sin * sin))
@@ -81,21 +81,21 @@ def fit_pose(rows: FitRows, lists: FitLists) -> PoseFit:
     lags = _sum_lagged_products(shared, lists, block, cos * along - sin * across, sin * along + cos * across)
     B = sums.shape[1]
     if B < FEWEST_BLOCKS:
-        return PoseFit(untold=f"{enough} lists in {B} × {_BLOCK_S:g} s; a pose needs {FEWEST_BLOCKS} such times")
-    without = [sums.sum(axis=1) - sums[:, k] for k in range(B)]
-    free, error = _solve_variances(sums.sum(axis=1)), _jackknife(np.array([_solve_variances(one) for one in without]))
+        return PoseFit(untold=f"{usable} lists in {B} × {_BLOCK_S:g} s; a pose needs {FEWEST_BLOCKS} such times")
+    left_out = [sums.sum(axis=1) - sums[:, k] for k in range(B)]
+    free, error = _solve_variances(sums.sum(axis=1)), _jackknife(np.array([_solve_variances(one) for one in left_out]))
     if not (free > t.ppf(_SURE, B - 1) * error).any():
-        whole = np.maximum(free, 0)
-        most = np.sqrt(np.maximum(whole + 1.96 * error, 0))
+        variances = np.maximum(free, 0)
+        most = np.sqrt(np.maximum(variances + 1.96 * error, 0))
         why = f"errors of different objects hang together no more than by chance (pose: < {most[0]:.2g} m, "
-        return PoseFit(untold=f"{why}< {np.rad2deg(most[1]):.2g}°, {enough} lists)")
-    whole, error = (
+        return PoseFit(untold=f"{why}< {np.rad2deg(most[1]):.2g}°, {usable} lists)")
+    variances, error = (
         _solve_nonnegative(sums.sum(axis=1)),
-        _jackknife(np.array([_solve_nonnegative(one) for one in without])),
+        _jackknife(np.array([_solve_nonnegative(one) for one in left_out])),
     )
-    shift, turn = (_estimate_sigma(value, off, enough, B) for value, off in zip(whole, error, strict=True))
+    shift, turn = (_estimate_sigma(value, off, usable, B) for value, off in zip(variances, error, strict=True))
     value, low, high = np.rad2deg([turn.value, turn.low, turn.high]).tolist()
-    memory = _fit_pose_memory(lags, float(np.median(np.diff(lists.captured_s)[np.diff(lists.log) == 0])), enough)
+    memory = _fit_pose_memory(lags, float(np.median(np.diff(lists.captured_s)[np.diff(lists.log) == 0])), usable)
     return PoseFit(shift, Estimate(value, low, high, turn.n, turn.n_effective), memory)
 
 
@@ -171,13 +171,13 @@ def _fit_pose_memory(lags: Float, period_s: float, n: int) -> LastingPart | None
         found: Float = least_squares(off, [0.7, np.log(10 * period_s)], bounds=([0, -5], [1, 9])).x
         return found
 
-    whole = fitted(lags.sum(axis=2))
-    each = np.array([fitted(lags.sum(axis=2) - lags[:, :, k]) for k in range(B)])
-    error = 1.96 * _jackknife(each)
-    if whole[0] - error[0] <= 0:
+    best = fitted(lags.sum(axis=2))
+    left_out = np.array([fitted(lags.sum(axis=2) - lags[:, :, k]) for k in range(B)])
+    error = 1.96 * _jackknife(left_out)
+    if best[0] - error[0] <= 0:
         return None
-    share = Estimate(float(whole[0]), float(whole[0] - error[0]), float(min(whole[0] + error[0], 1.0)), n, B)
-    low, middle, high = np.exp([whole[1] - error[1], whole[1], whole[1] + error[1]])
+    share = Estimate(float(best[0]), float(best[0] - error[0]), float(min(best[0] + error[0], 1.0)), n, B)
+    low, middle, high = np.exp([best[1] - error[1], best[1], best[1] + error[1]])
     if middle > 3 * delta_s[-1]:
         return LastingPart(share, "always")
     return LastingPart(share, Estimate(float(middle), float(low), float(high), n, B))
@@ -204,11 +204,11 @@ class DelayFit:
 
     @property
     def seconds(self) -> float:
-        """The delay that is used."""
+        """The delay in use."""
         return self.estimate.value
 
     def seconds_of(self, log: str) -> float:
-        """The delay that is used for a log."""
+        """The delay in use for a log."""
         return self.of_log.get(log, self.estimate.value)
 
 
@@ -221,19 +221,19 @@ def unit_delay(
     A delay that could also be a shift along the way is used only where none is declared. `by` log: each log has its
     own, where it tells one; class: each log whose objects are of one class, `held_out` ones too, has that of the class.
     """
-    if all(found.capture_said.all() for _, found in logs):
-        late_s = np.concatenate([found.tracks.arrives_s[0] - found.tracks.captured_s for _, found in logs])
+    if all(lists.capture_said.all() for _, lists in logs):
+        late_s = np.concatenate([lists.tracks.arrives_s[0] - lists.tracks.captured_s for _, lists in logs])
         low, middle, high = np.quantile(late_s, [0.025, 0.5, 0.975])
         note = "every list says when it was captured; the interval holds 95 % of the lists"
         return DelayFit(Estimate(float(middle), float(low), float(high), len(late_s), float(len(late_s))), (note,))
-    delays = {recording.scene.log: estimate_delay(found, recording.scene, recording.truth) for recording, found in logs}
+    delays = {recording.scene.log: estimate_delay(lists, recording.scene, recording.truth) for recording, lists in logs}
     pooled = pool_delays(delays, declared_s)
     if by == "log":
         return replace(pooled, of_log={log: one.offset_s for log, one in delays.items() if one.untold is None})
     of_class = _estimate_by_class(logs) if by == "class" else {}
     kinds = {one.scene.log: _list_classes(one) for one in (*(one for one, _ in logs), *held_out)}
-    told = {(kind,): one.value for kind, one in of_class.items() if np.isfinite(one.low)}
-    return replace(pooled, of_log={log: told[one] for log, one in kinds.items() if one in told}, of_class=of_class)
+    known = {(kind,): one.value for kind, one in of_class.items() if np.isfinite(one.low)}
+    return replace(pooled, of_log={log: known[one] for log, one in kinds.items() if one in known}, of_class=of_class)
 
 
 def _list_classes(recording: Recording) -> tuple[str, ...]:
@@ -245,23 +245,23 @@ def _estimate_by_class(logs: Sequence[tuple[Recording, RecordedLists]]) -> dict[
     """By class the delay of entries about its objects: as that of all, against the truth of this class alone."""
     out = {}
     for kind in sorted({kind for recording, _ in logs for kind in _list_classes(recording)}):
-        told = {}
-        for recording, found in logs:
+        delays = {}
+        for recording, recorded in logs:
             truth, scene = recording.truth, recording.scene
             of_kind = truth.take_tracks(scene.object_class[truth.object_ix] == CLASSES.index(kind))
             if len(of_kind.object_ix):
-                told[scene.log] = estimate_delay(found, scene, of_kind)
-        out[kind] = pool_delays(told, None).estimate
+                delays[scene.log] = estimate_delay(recorded, scene, of_kind)
+        out[kind] = pool_delays(delays, None).estimate
     return out
 
 
-def pool_delays(told: Mapping[str, TimeOffset], declared_s: float | None) -> DelayFit:
+def pool_delays(delays: Mapping[str, TimeOffset], declared_s: float | None) -> DelayFit:
     """The delay of several logs: their mean, with what they scatter by from three logs on (`pool_logs`)."""
-    notes = tuple(f"delay in {log}: {delay_words(one)}" for log, one in told.items()) + _note_contradiction(told)
-    unambiguous = [one for one in told.values() if one.untold is None and not one.unbiased]
+    notes = tuple(f"delay in {log}: {delay_words(one)}" for log, one in delays.items()) + _note_contradiction(delays)
+    unambiguous = [one for one in delays.values() if one.untold is None and not one.unbiased]
     if unambiguous:
         return DelayFit(_weigh_delays(unambiguous), notes)
-    usable = [one for one in told.values() if one.untold is None]
+    usable = [one for one in delays.values() if one.untold is None]
     why = "no log tells it from a shift along the way" if usable else "no log tells it"
     if declared_s is not None or not usable:
         return DelayFit(Estimate(declared_s or 0.0, why=f"{why}; kept as declared"), notes)
@@ -270,30 +270,30 @@ def pool_delays(told: Mapping[str, TimeOffset], declared_s: float | None) -> Del
     return DelayFit(Estimate(mean.value, mean.low, mean.high, mean.n, mean.n_effective, why=why_used), notes)
 
 
-def _pool_offsets(told: Sequence[TimeOffset]) -> LogPool:
-    sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in told])
-    return pool_logs(np.array([one.offset_s for one in told]), sigma_s**2, sum(one.entries for one in told))
+def _pool_offsets(offsets: Sequence[TimeOffset]) -> LogPool:
+    sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in offsets])
+    return pool_logs(np.array([one.offset_s for one in offsets]), sigma_s**2, sum(one.entries for one in offsets))
 
 
-def _note_contradiction(told: Mapping[str, TimeOffset]) -> tuple[str, ...]:
+def _note_contradiction(delays: Mapping[str, TimeOffset]) -> tuple[str, ...]:
     """A line with the delays of all logs where chance does not make them differ so."""
-    usable = {log: one for log, one in told.items() if one.untold is None}
+    usable = {log: one for log, one in delays.items() if one.untold is None}
     if len(usable) < FEWEST_LOGS or not _pool_offsets(list(usable.values())).contradict:
         return ()
     each = ", ".join(f"{one.offset_s:.3f} s in {log}" for log, one in usable.items())
     return (f"delays contradict each other beyond chance: {each}; --delay-by log or class takes each its own",)
 
 
-def _weigh_delays(told: Sequence[TimeOffset]) -> Estimate:
-    if len(told) >= FEWEST_LOGS:
-        return _pool_offsets(told).mean
-    offset_s = np.array([one.offset_s for one in told])
-    sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in told])
+def _weigh_delays(offsets: Sequence[TimeOffset]) -> Estimate:
+    if len(offsets) >= FEWEST_LOGS:
+        return _pool_offsets(offsets).mean
+    offset_s = np.array([one.offset_s for one in offsets])
+    sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in offsets])
     weight = 1 / sigma_s**2
     mean_s = float((weight * offset_s).sum() / weight.sum())
     wider = 1.0  # Birge's ratio
-    if len(told) > 1:
-        wider = max(1.0, float(np.sqrt((weight * (offset_s - mean_s) ** 2).sum() / (len(told) - 1))))
+    if len(offsets) > 1:
+        wider = max(1.0, float(np.sqrt((weight * (offset_s - mean_s) ** 2).sum() / (len(offsets) - 1))))
     half_s = float(_Z * wider / np.sqrt(weight.sum()))
-    n = sum(one.entries for one in told)
+    n = sum(one.entries for one in offsets)
     return Estimate(mean_s, mean_s - half_s, mean_s + half_s, n, float("nan"))

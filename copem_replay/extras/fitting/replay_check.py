@@ -70,7 +70,7 @@ def replay_check(
     `placed`: the error of the unit's pose, drawn beside the model's errors.
     """
     recorded = compute_statistics(rows.listed[None], rows.along_m[None], rows.across_m[None], rows)
-    each, totals = [], list[Float]()
+    statistics, totals = [], list[Float]()
     step = max(1, _CELLS // len(rows.listed))  # runs at a time
     for first in range(0, runs, step):
         some = np.arange(first, min(first + step, runs))
@@ -78,9 +78,9 @@ def replay_check(
         if not totals:
             expected = listed.mean(axis=0)
             totals.append(compute_totals(rows.listed[None], rows, expected))
-        each.append(compute_statistics(listed, along_m, across_m, rows))
+        statistics.append(compute_statistics(listed, along_m, across_m, rows))
         totals.append(compute_totals(listed, rows, expected))
-    replayed = {name: np.concatenate([one[name] for one in each]) for name in STATISTICS}
+    replayed = {name: np.concatenate([one[name] for one in statistics]) for name in STATISTICS}
     class_of_pass = rows.view.class_ix[pass_starts(rows.pass_ix)[:-1]]
     checks = compare_statistics(recorded, replayed, seed=seed)
     checks += compare_totals(np.concatenate(totals), len(class_of_pass))
@@ -184,12 +184,12 @@ def compute_statistics(listed: Bool, along_m: Float, across_m: Float, rows: FitR
 
 
 @kernel
-def _fill_statistics(listed: Bool, along: Float, across: Float, at: Float, start: Int, out: Float) -> None:
+def _fill_statistics(listed: Bool, along: Float, across: Float, at_s: Float, start: Int, out: Float) -> None:
     for s in range(listed.shape[0]):
         for k in range(len(start) - 1):
             a, b = start[k], start[k + 1]
             first, last = np.inf, -1
-            run = longest = hits = told = gaps = pairs = 0
+            run = longest = hits = n_errors = gaps = pairs = 0
             gap_s = squares = east = north = product = 0.0
             for i in range(a, b):
                 if not listed[s, i]:
@@ -197,20 +197,20 @@ def _fill_statistics(listed: Bool, along: Float, across: Float, at: Float, start
                     longest = max(longest, run)
                     continue
                 if hits == 0:
-                    first = at[i] - at[a]
+                    first = at_s[i] - at_s[a]
                 elif run > 0:
                     gaps += 1
-                    gap_s += at[i] - at[last]
+                    gap_s += at_s[i] - at_s[last]
                 run, last, hits = 0, i, hits + 1
                 if np.isfinite(along[s, i]):  # entries beside another object have no error
-                    told += 1
+                    n_errors += 1
                     squares += along[s, i] ** 2 + across[s, i] ** 2
                     east += along[s, i]
                     north += across[s, i]
             spread = np.nan
-            if told > 0:
-                east, north = east / told, north / told
-                spread = squares / told - east**2 - north**2
+            if n_errors > 0:
+                east, north = east / n_errors, north / n_errors
+                spread = squares / n_errors - east**2 - north**2
             for i in range(a + 1, b):
                 if np.isfinite(along[s, i]) and np.isfinite(along[s, i - 1]) and listed[s, i] and listed[s, i - 1]:
                     pairs += 1
@@ -219,7 +219,7 @@ def _fill_statistics(listed: Bool, along: Float, across: Float, at: Float, start
             out[0, s, k] = first
             out[1, s, k] = longest
             out[2, s, k] = hits / (b - a)
-            out[3, s, k] = np.sqrt(squares / told) if told else np.nan
+            out[3, s, k] = np.sqrt(squares / n_errors) if n_errors else np.nan
             out[4, s, k] = product / pairs / spread if pairs > 2 and spread > 1e-12 else np.nan
             out[5, s, k] = gap_s / gaps if gaps else np.nan
 

@@ -69,18 +69,18 @@ def fit_classes(rows: FitRows, series: ResidualSeries) -> ClassesFit:
         )
     counts = np.zeros((len(CLASSES), len(CLASSES)))
     np.add.at(counts, (true, listed), 1.0)
-    seen = (counts > 0) | (np.eye(len(CLASSES), dtype=bool) & (counts.sum(axis=1) > 0)[:, None])
-    smooth = np.where(seen, counts + 0.5, 0.0)
+    possible = (counts > 0) | (np.eye(len(CLASSES), dtype=bool) & (counts.sum(axis=1) > 0)[:, None])
+    smooth = np.where(possible, counts + 0.5, 0.0)
     shares = np.ascontiguousarray((smooth / np.maximum(smooth.sum(axis=1), 1)[:, None])[true])
 
     def of(x: Float) -> float:
         return float(log_classes(shares, listed, series.decay(float(np.exp(x[1]))), series.new, float(expit(x[0]))))
 
     best, value = maximise_likelihood(of, [(w, np.log(tau_s)) for w in (-1.0, 1.5) for tau_s in (0.3, 3.0)], _BOUNDS)
-    fresh = float(log_classes(shares, listed, series.decay(1.0), series.new, 0.0))
+    log_fresh = float(log_classes(shares, listed, series.decay(1.0), series.new, 0.0))
     memory: tuple[LastingPart, ...] = ()
     share, tau_s = 0.0, 1.0
-    if value - fresh > _WORTH_IT:
+    if value - log_fresh > _WORTH_IT:
         share, tau_s = float(expit(best[0])), float(np.exp(best[1]))
         lasts = expit(profile_limits(of, best, value, 0, _BOUNDS)), np.exp(profile_limits(of, best, value, 1, _BOUNDS))
         n = len(true)
@@ -96,7 +96,7 @@ def fit_classes(rows: FitRows, series: ResidualSeries) -> ClassesFit:
     for k in np.flatnonzero(counts.sum(axis=1)):
         n = int(counts[k].sum())
         worth = n * n / pairs[k]
-        kinds = np.flatnonzero(seen[k])
+        kinds = np.flatnonzero(possible[k])
         confusion[CLASSES[k]] = {CLASSES[j]: _estimate_probability(counts[k, j], n, worth, len(kinds)) for j in kinds}
     return ClassesFit(confusion, memory)
 
@@ -132,30 +132,30 @@ class ExistenceFit:
             return {"existence": CommentedValue(round(self.number.value, 4), "the same of every entry")}
         if self.real is None:
             return {}
-        both = {
+        shapes_of = {
             "real": ("", self.real),
             "ghost": ("", self.ghost) if self.ghost else ("chosen, as of objects: ", self.real),
         }
         shapes = {
             name: CommentedValue([round_digits(one.value) for one in two], more + "; ".join(one.words() for one in two))
-            for name, (more, two) in both.items()
+            for name, (more, two) in shapes_of.items()
         }
         return {"existence": {"kind": "scores", **shapes}}
 
 
-def fit_existence(real: Float, series_ix: Int, other: Float | None) -> ExistenceFit:
-    """Fit the claims about real objects (n,), by series, and of `other` entries (None: the truth is not complete)."""
+def fit_existence(real: Float, series_ix: Int, unmatched: Float | None) -> ExistenceFit:
+    """Fit existence claims of matched entries (n,), by series, and of `unmatched` ones; None: the truth is partial."""
     finite = np.isfinite(real)
     claimed, series_ix = real[finite], series_ix[finite]
     if len(claimed) < _FEWEST:
         return ExistenceFit(untold="the lists have no existence" if not len(claimed) else f"{len(claimed)} entries")
-    others = None if other is None else other[np.isfinite(other)]
+    unmatched_claims = None if unmatched is None else unmatched[np.isfinite(unmatched)]
     if claimed.std() < 1e-6:
         mean = float(claimed.mean())
         return ExistenceFit(number=Estimate(mean, mean, mean, len(claimed), len(claimed)))
     ghost = None
-    if others is not None and len(others) >= _FEWEST and others.std() > 1e-6:
-        ghost = beta_shapes(others, np.arange(len(others)))
+    if unmatched_claims is not None and len(unmatched_claims) >= _FEWEST and unmatched_claims.std() > 1e-6:
+        ghost = beta_shapes(unmatched_claims, np.arange(len(unmatched_claims)))
     real_shapes = beta_shapes(claimed, series_ix)
     if ghost is not None:
         real_shapes = _correct_for_ghosts(claimed, real_shapes, (ghost[0].value, ghost[1].value))
@@ -167,11 +167,11 @@ def beta_shapes(values: Float, cluster: Int) -> tuple[Estimate, Estimate]:
 
     With fewer than eight clusters it is over tenths of the rows, with more than 400 over 200 parts of them.
     """
-    names, which = np.unique(cluster, return_inverse=True)
+    names, group = np.unique(cluster, return_inverse=True)
     if len(names) < 8 or len(names) > 400:
-        which = np.arange(len(values)) * (10 if len(names) < 8 else 200) // len(values)
-    groups = int(which.max()) + 1
-    sums = np.array([np.bincount(which, weights, groups) for weights in (np.ones(len(values)), values, values**2)])
+        group = np.arange(len(values)) * (10 if len(names) < 8 else 200) // len(values)
+    groups = int(group.max()) + 1
+    sums = np.array([np.bincount(group, weights, groups) for weights in (np.ones(len(values)), values, values**2)])
     shapes = _solve_shapes(sums.sum(axis=1))
     each = np.log([_solve_shapes(sums.sum(axis=1) - sums[:, g]) for g in range(groups)])
     error = np.sqrt((groups - 1) / groups * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
@@ -267,11 +267,11 @@ def fit_list_times(lists: FitLists) -> ListTimesFit:
         return ListTimesFit(period, jitter, untold, Estimate(float("nan"), n=n, why=why))
     missing = np.maximum(np.rint(long / period_s) - 1, 2)
     K = len(long)
-    stays = float((missing - 2).sum() / ((missing - 2).sum() + K))  # longer than two lists: geometric
-    stays = min(max(stays, 0.5 / (K + 1)), 1 - 1e-6)
-    begins = K / stays / len(gaps_s)  # those of one list, too
-    down = begins / (begins + 1 - stays)
-    phi = max(stays - begins, 1e-3)
+    p_stays = float((missing - 2).sum() / ((missing - 2).sum() + K))  # longer than two lists: geometric
+    p_stays = min(max(p_stays, 0.5 / (K + 1)), 1 - 1e-6)
+    begins = K / p_stays / len(gaps_s)  # those of one list, too
+    down = begins / (begins + 1 - p_stays)
+    phi = max(p_stays - begins, 1e-3)
     lasts_s = -period_s / np.log(phi) / (1 - down)
     low, high = garwood_interval(K)
     lasts = Estimate(lasts_s, lasts_s * K / high, lasts_s * K / low, n, K)
@@ -299,7 +299,7 @@ class RestFit:
     untold: dict[str, str]
 
     def pem_keys(self) -> dict[str, Any]:
-        """Keys of a PEM beside its couples: `classes`, `ghosts`, `tracks`, and `memory` of the class."""
+        """The keys of a PEM beside its couples: `classes`, `ghosts`, `tracks`, and `memory` of the class."""
         ids, lasting = self.ids_last_s, [part.keys() for part in self.classes.memory]
         out: dict[str, Any] = {
             "classes": self.classes.keys(),
@@ -310,7 +310,7 @@ class RestFit:
         return {key: value for key, value in out.items() if value}
 
     def unit_keys(self) -> dict[str, Any]:
-        """Keys of the unit: `placed`, `outages`."""
+        """The keys of the unit: `placed`, `outages`."""
         out = {"placed": self.placed.keys(), "outages": self.list_times.keys()}
         return {key: value for key, value in out.items() if value}
 

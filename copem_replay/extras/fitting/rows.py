@@ -63,7 +63,7 @@ class FitRows:
     apart: Bool | None = None
 
     def take(self, rows: Int | Bool) -> FitRows:
-        """Some rows, by index or mask."""
+        """The rows at these indices or in this mask."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else rows
         out = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         return FitRows(
@@ -181,11 +181,11 @@ def pool_rows(rows: NodeWeights, listed: Bool, pass_number: Int) -> PooledRows:
     """Rows (R,) pooled by node, sixteenth of the way between nodes, and hit or miss."""
     along = [np.rint(rows.weight[:, m].sum(axis=1) * _PARTS).astype(np.int64) for m in ([1, 3], [2, 3])]
     label = ((rows.node[:, 0] * (_PARTS + 1) + along[0]) * (_PARTS + 1) + along[1]) * 2 + listed
-    _, first, which, size = np.unique(label, return_index=True, return_inverse=True, return_counts=True)
+    _, first, label_ix, size = np.unique(label, return_index=True, return_inverse=True, return_counts=True)
     shape = (int(pass_number.max()) + 1, len(first))
-    count = csr_array((np.ones(len(which)), (pass_number, which)), shape=shape)
+    count = csr_array((np.ones(len(label_ix)), (pass_number, label_ix)), shape=shape)
     count.sum_duplicates()
-    weight = np.stack([np.bincount(which, one) / size for one in rows.weight.T], axis=1)
+    weight = np.stack([np.bincount(label_ix, one) / size for one in rows.weight.T], axis=1)
     return PooledRows(NodeWeights(rows.node[first], weight, rows.shape), listed[first], count)
 
 
@@ -201,15 +201,15 @@ def count_rows_per_effective(residual: Float, pass_ix: Int) -> float:
     ρₖ: correlation of rows of a pass that are k apart, each pair counted once, as in the sum (1 − k/m) ρₖ of a pass of
     m. Summed in pairs of neighbours until a pair is not positive (Geyer, Statist. Sci. 7 (1992) 473–483).
     """
-    whole = float(residual @ residual)
-    if whole == 0:
+    square_sum = float(residual @ residual)
+    if square_sum == 0:
         return 1.0
     total, odd = 0.0, 0.0
     for k in range(1, min(_LONGEST, len(residual))):
         same = pass_ix[k:] == pass_ix[:-k]
         if not same.any():
             break
-        correlation = float((residual[k:] * residual[:-k])[same].sum()) / whole
+        correlation = float((residual[k:] * residual[:-k])[same].sum()) / square_sum
         if k % 2 == 0 and odd + correlation <= 0:
             break
         if k % 2 == 0:

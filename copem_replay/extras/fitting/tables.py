@@ -34,26 +34,26 @@ def fit_em(
     are extrapolated where that is better (SQUAREM, scheme 3; Varadhan and Roland, Scand. J. Statist. 35, 2008).
     """
     counts = np.zeros((2, len(theta)))
-    here = theta.copy()
+    current = theta.copy()
     for _ in range(300):
-        _share_out(here, node, weight, hit, count, prior, counts)
-        one = _divide_counts(counts, shape, monotone)
-        level = _share_out(one, node, weight, hit, count, prior, counts)
-        two = _divide_counts(counts, shape, monotone)
-        first, second = one - here, two - 2 * one + here
-        done = np.abs(two - one).max() < _CLOSE
+        _share_out(current, node, weight, hit, count, prior, counts)
+        step1 = _divide_counts(counts, shape, monotone)
+        level = _share_out(step1, node, weight, hit, count, prior, counts)
+        step2 = _divide_counts(counts, shape, monotone)
+        first, second = step1 - current, step2 - 2 * step1 + current
+        done = np.abs(step2 - step1).max() < _CLOSE
         ahead = np.sqrt((first**2).sum() / max((second**2).sum(), 1e-300))
-        here, far = two, here + 2 * ahead * first + ahead**2 * second
+        current, leap = step2, current + 2 * ahead * first + ahead**2 * second
         if done:
             break
         if ahead > 1:
-            far = np.minimum(np.maximum(far, _LEAST), 1 - _LEAST)
+            leap = np.minimum(np.maximum(leap, _LEAST), 1 - _LEAST)
             if monotone:
-                far = monotone_tables(far, np.ones(len(far)), shape)
-            if _share_out(far, node, weight, hit, count, prior, counts) > level:
-                here = far
-    _share_out(here, node, weight, hit, count, prior, counts)
-    return here, counts - prior
+                leap = monotone_tables(leap, np.ones(len(leap)), shape)
+            if _share_out(leap, node, weight, hit, count, prior, counts) > level:
+                current = leap
+    _share_out(current, node, weight, hit, count, prior, counts)
+    return current, counts - prior
 
 
 @callee
@@ -98,22 +98,22 @@ def monotone_tables(value: Float, weight: Float, shape: Int) -> Float:
     """
     tables, ranges, shares = shape
     out = value.copy()
-    taken = np.zeros((2, len(value)))
+    corrections = np.zeros((2, len(value)))
     for _ in range(1000):
         before = out.copy()
         for order in range(2):
-            wanted = out + taken[order]
+            target = out + corrections[order]
             for g in range(tables):
                 first = g * ranges * shares
                 if order == 0:
                     for j in range(shares):
                         part = slice(first + j, first + ranges * shares, shares)
-                        out[part] = -_fit_ascending(-wanted[part], weight[part])
+                        out[part] = -_fit_ascending(-target[part], weight[part])
                 else:
                     for i in range(ranges):
                         part = slice(first + i * shares, first + (i + 1) * shares)
-                        out[part] = _fit_ascending(wanted[part], weight[part])
-            taken[order] = wanted - out
+                        out[part] = _fit_ascending(target[part], weight[part])
+            corrections[order] = target - out
         if ranges == 1 or shares == 1 or np.abs(out - before).max() < 1e-10:
             break
     return out
@@ -187,15 +187,15 @@ def _shrink_table(
         a, b = strength * parent, strength * (1 - parent)
         prior = worth * np.stack([a, b])
         theta = fit_em(theta, placed.node, placed.weight, hit, count, prior, shape, monotone)[0]
-        p, inside = placed.chances(theta), theta * (1 - theta)
-        curve = inside[:, None] * fisher_information(placed, theta, count / worth) * inside + np.diag(strength * inside)
-        likely = (
+        p, spread = placed.chances(theta), theta * (1 - theta)
+        curve = spread[:, None] * fisher_information(placed, theta, count / worth) * spread + np.diag(strength * spread)
+        log_likelihood = (
             count @ np.log(np.where(hit, p, 1 - p)) / worth
             + (a * np.log(theta) + b * np.log1p(-theta) - betaln(a, b) + np.log(2 * np.pi) / 2).sum()
             - np.linalg.slogdet(curve)[1] / 2
         )
-        if likely > best[0]:
-            best = float(likely), theta, strength
+        if log_likelihood > best[0]:
+            best = float(log_likelihood), theta, strength
     return best[1:]
 
 
@@ -214,19 +214,19 @@ def estimate_nodes(entries: PooledRows, rows: NodeWeights, fit: TableFit) -> lis
     (`metrics/limits.py`), V the variance by the scores of whole passes.
     """
     theta, placed = fit.theta, entries.placed
-    inside, dense = theta * (1 - theta), placed.dense()
+    spread, dense = theta * (1 - theta), placed.dense()
     strength = fit.strength[-1] if fit.strength else 1.0
     information = fisher_information(placed, theta, np.asarray(entries.count.sum(axis=0)))
-    inverse = np.linalg.inv(information + fit.worth * np.diag(strength / inside))
+    inverse = np.linalg.inv(information + fit.worth * np.diag(strength / spread))
     touched = np.bincount(rows.node[rows.weight > 0], minlength=len(theta))
-    effective = np.minimum(inside / np.diag(inverse), touched) / fit.worth
+    effective = np.minimum(spread / np.diag(inverse), touched) / fit.worth
     p = np.clip(placed.chances(theta), 1e-9, 1 - 1e-9)
     scores = entries.count @ (dense * ((entries.hit - p) / (p * (1 - p)))[:, None])
     passes = ((entries.count @ (dense > 0)) > 0).sum(axis=0)
     several = np.maximum(passes, 2)
     variance = ((scores @ inverse) ** 2).sum(axis=0) * several / (several - 1)
     ratio = t.ppf(0.975, np.maximum(touched - 1, 1)) / t.ppf(0.975, several - 1)
-    by_passes = np.where(variance > 0, inside / np.maximum(variance, 1e-300) * ratio**2, np.inf)
+    by_passes = np.where(variance > 0, spread / np.maximum(variance, 1e-300) * ratio**2, np.inf)
     effective = np.where(passes < PASSES_ALONE, effective, np.maximum(np.minimum(effective, by_passes), 1.0))
     limits = (betaincinv(theta * effective + 0.5, (1 - theta) * effective + 0.5, q) for q in (0.025, 0.975))
     columns = (column.tolist() for column in (theta, *limits, touched, effective))

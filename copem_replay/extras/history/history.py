@@ -55,10 +55,8 @@ class JudgedFolder:
 
 
 def read_history(folders: Sequence[Path], page: Path) -> list[JudgedFolder]:
-    """The folders of a history, in their order. Raises InputError, a line for each that cannot be read or has no
-    verdicts.
-    """
-    found: list[JudgedFolder] = []
+    """The folders of a history, in their order. Raises InputError, one line per damaged one or one without verdicts."""
+    judged: list[JudgedFolder] = []
     problems: list[str] = []
     seen: dict[str, Path] = {}
     for folder in folders:
@@ -68,15 +66,15 @@ def read_history(folders: Sequence[Path], page: Path) -> list[JudgedFolder]:
             results = open_results(folder, "summary.csv")
             if (verdicts := find_verdicts(folder)) is None:
                 raise InputError(f"{folder}: expected {FILE}, found none; `copem-replay verdict {folder}` writes it")
-            there = (folder / REPORT).is_file()
+            has_report = (folder / REPORT).is_file()
             path = os.path.relpath(os.path.realpath(folder / REPORT), os.path.realpath(page.parent))
             label = str(results.provenance.data.get("label") or results.name)
-            found.append(JudgedFolder(results, verdicts, label, quote(Path(path).as_posix()) if there else None))
+            judged.append(JudgedFolder(results, verdicts, label, quote(Path(path).as_posix()) if has_report else None))
         except InputError as error:
             problems += error.problems
     if problems:
         raise InputError(problems)
-    return found
+    return judged
 
 
 def write_history(folders: Sequence[str | PathLike[str]], file: str | PathLike[str] = "history.html") -> Path:
@@ -108,28 +106,28 @@ _MOST_TURNS = 12
 def history_page(folders: Sequence[JudgedFolder]) -> str:
     """The whole page as HTML."""
     rows = _rows_of(folders)
-    turned = {key: turns for key, of in rows.items() if (turns := find_turns(of))}
+    turns_of = {key: turns for key, of in rows.items() if (turns := find_turns(of))}
     sections = [
         ("criteria", "Criteria", _criteria_table(folders, rows)),
         ("folders", "Folders", _folders_table(folders)),
         ("summaries", "Figures", _summaries_table(folders)),
-        ("differences", "Side by side", _side_by_side(folders, turned)),
+        ("differences", "Side by side", _side_by_side(folders, turns_of)),
     ]
     newest = folders[-1]
-    said = [f"The newest, {newest.label}: {newest.verdicts.headline}."]
-    for (criterion, configuration, group), turns in turned.items():
+    sentences = [f"The newest, {newest.label}: {newest.verdicts.headline}."]
+    for (criterion, configuration, group), turns in turns_of.items():
         k, before, after = turns[-1]
         if k == len(folders) - 1:
             name = f"{criterion}: {group}" if group else criterion
-            said.append(f"{name}, {configuration}: {before} before, {after} now.")
-    if (more := len(said) - 1 - _MOST_TURNS) > 0:
-        said = [*said[:-more], f"… and {more} more turned."]
+            sentences.append(f"{name}, {configuration}: {before} before, {after} now.")
+    if (more := len(sentences) - 1 - _MOST_TURNS) > 0:
+        sentences = [*sentences[:-more], f"… and {more} more turned."]
     head = make_tag(
         "header",
         make_tag("h1", "What became of the criteria?"),
         make_tag("p", f"{count_noun(len(rows), 'verdict')} of each of {count_noun(len(folders), 'folder')}, the "
                  "newest last, in the order in which they were given.", class_="question"),
-        make_list(said),
+        make_list(sentences),
         section_links((id_, title) for id_, title, _ in sections),
     )  # fmt: skip
     below = (make_tag("section", make_tag("h2", title), body, id_=id_) for id_, title, body in sections)
@@ -146,25 +144,25 @@ def _rows_of(folders: Sequence[JudgedFolder]) -> dict[_Key, list[Verdict | None]
 
 
 def find_turns(verdicts: Sequence[Verdict | None]) -> list[tuple[int, str, str]]:
-    """Where a verdict is another than in the folder before that has one: its number, the word before, and its own."""
+    """The changes of a verdict from the folder before that has one: the index, the word before, and the new word."""
     turns: list[tuple[int, str, str]] = []
     before: str | None = None
-    for k, one in enumerate(verdicts):
-        if one is None:
+    for k, verdict in enumerate(verdicts):
+        if verdict is None:
             continue
-        if before is not None and one.verdict != before:
-            turns.append((k, before, one.verdict))
-        before = one.verdict
+        if before is not None and verdict.verdict != before:
+            turns.append((k, before, verdict.verdict))
+        before = verdict.verdict
     return turns
 
 
 def _criteria_table(folders: Sequence[JudgedFolder], rows: dict[_Key, list[Verdict | None]]) -> Html:
     lines = []
-    for of in rows.values():
-        last = next(one for one in reversed(of) if one is not None)
-        turns = find_turns(of)
-        turned = [f"{after} at ", folders[turns[0][0]].title] if (after := turns[0][2] if turns else "") else ["–"]
-        strip = make_tag("span", *map(verdict_mark, of), class_="strip")
+    for verdicts in rows.values():
+        last = next(one for one in reversed(verdicts) if one is not None)
+        turns = find_turns(verdicts)
+        first_turn = [f"{after} at ", folders[turns[0][0]].title] if (after := turns[0][2] if turns else "") else ["–"]
+        strip = make_tag("span", *map(verdict_mark, verdicts), class_="strip")
         lines.append(
             make_tag(
                 "tr",
@@ -172,9 +170,9 @@ def _criteria_table(folders: Sequence[JudgedFolder], rows: dict[_Key, list[Verdi
                 make_tag("td", allow_breaks(last.configuration), class_="text"),
                 make_tag("td", allow_breaks(last.asked), class_="text"),
                 make_tag("td", strip, class_="text"),
-                make_tag("td", draw_strip(of), class_="text"),
+                make_tag("td", draw_strip(verdicts), class_="text"),
                 make_tag("td", last.found, " ", make_tag("span", last.limits, class_="interval")),
-                make_tag("td", *turned, class_="text"),
+                make_tag("td", *first_turn, class_="text"),
             )
         )
     head = ["criterion", "configuration", "bound", "verdicts", "figure", "newest", "first turned"]
@@ -198,19 +196,19 @@ def draw_strip(verdicts: Sequence[Verdict | None]) -> Html:
         return f"{_EDGE_PX + (high - value) / (high - low) * (_HEIGHT_PX - 2 * _EDGE_PX):.1f}"
 
     parts: list[Html] = []
-    for k, one in enumerate(verdicts):
-        if one is None:
+    for k, mark in enumerate(verdicts):
+        if mark is None:
             continue
         x = _STEP_PX * (k + 0.5)
         left, right = f"{x - _STEP_PX / 2:.1f}", f"{x + _STEP_PX / 2:.1f}"
-        bound = place_of(one.bound)
+        bound = place_of(mark.bound)
         parts.append(make_tag("line", x1=left, x2=right, y1=bound, y2=bound, class_="bound"))
-        if one.limits != "–":
-            ends = [place_of(high if one.high is None else one.high), place_of(low if one.low is None else one.low)]
+        if mark.limits != "–":
+            ends = [place_of(high if mark.high is None else mark.high), place_of(low if mark.low is None else mark.low)]
             parts.append(make_tag("line", x1=f"{x:.1f}", x2=f"{x:.1f}", y1=ends[0], y2=ends[1], class_="limits"))
-        if one.estimate is not None:
-            kind = f"found {one.verdict.replace(' ', '-')}" + ("" if one.limits != "–" else " open")
-            parts.append(make_tag("circle", cx=f"{x:.1f}", cy=place_of(one.estimate), r="3.5", class_=kind))
+        if mark.estimate is not None:
+            kind = f"found {mark.verdict.replace(' ', '-')}" + ("" if mark.limits != "–" else " open")
+            parts.append(make_tag("circle", cx=f"{x:.1f}", cy=place_of(mark.estimate), r="3.5", class_=kind))
     width = _STEP_PX * len(verdicts)
     words = f"{shown[-1].metric} of {count_noun(len(shown), 'folder')}, from {format_cell(low)} to {format_cell(high)}"
     return make_tag(
@@ -292,11 +290,11 @@ def _difference_table(new: JudgedFolder, old: JudgedFolder) -> Html:
         rows = list(_difference_rows(new.results, old.results))
     except InputError as error:
         return make_tag("p", f"Not comparable: {'; '.join(error.problems)}.")
-    metrics = list(dict.fromkeys(str(row["metric"]) for _, of in rows for row in of))
+    metrics = list(dict.fromkeys(str(row["metric"]) for _, metric_rows in rows for row in metric_rows))
     metrics = [name for name in COMPARED if name in metrics]
     lines = []
-    for name, of in rows:
-        by_metric = {str(row["metric"]): row for row in of}
+    for name, metric_rows in rows:
+        by_metric = {str(row["metric"]): row for row in metric_rows}
         cells = (_difference_words(by_metric.get(metric)) for metric in metrics)
         lines.append(make_tag("tr", make_tag("th", allow_breaks(name), scope="row"), *cells))
     return make_table(["configuration", *metrics], lines)

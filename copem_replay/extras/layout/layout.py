@@ -35,9 +35,7 @@ _NEVER_NS = 2**62
 
 @dataclass(frozen=True)
 class ReplayContents:
-    """The content of a replay.mcap: configurations, their colours (`#rrggbb`), objects, whether the truth is drawn, and
-    the frame to follow.
-    """
+    """The scenes of a replay.mcap: configurations, colours (`#rrggbb`), objects, drawn truth, and frame to follow."""
 
     configurations: tuple[str, ...]
     colours: dict[str, str]
@@ -60,7 +58,7 @@ def read_contents(replay: Path) -> ReplayContents:
                 if t.startswith(PREFIX) and t.endswith(SUFFIX) and t != TRUTH_TOPICS[0]
             )
             moves = next((m.data for *_, m in reader.iter_messages(topics=TRUTH_TOPICS[2:])), b"")
-            made = {record.name: record.metadata for record in reader.iter_metadata()}.get(RUN_RECORD, {})
+            run_record = {record.name: record.metadata for record in reader.iter_metadata()}.get(RUN_RECORD, {})
             details = [f"{PREFIX}{name}/detail" for name in names]
             known: dict[str, dict[str, int]] = {}
             for _, channel, message in reader.iter_messages(topics=details) if details else ():
@@ -75,19 +73,19 @@ def read_contents(replay: Path) -> ReplayContents:
     objects = sorted(apart, key=lambda name: -apart[name])[:TOLD_OBJECTS]
     follow = next((frame for frame in (EGO_FRAME, MIDDLE_FRAME) if frame.encode() in moves), None)
     return ReplayContents(
-        names, _find_colours(made.get("experiment", ""), names), tuple(objects), TRUTH_TOPICS[1] in topics, follow
+        names, _find_colours(run_record.get("experiment", ""), names), tuple(objects), TRUTH_TOPICS[1] in topics, follow
     )
 
 
 def _find_colours(experiment: str, names: Sequence[str]) -> dict[str, str]:
     """The colour of each configuration, `#rrggbb`, by the experiment that made the replay."""
     try:
-        asked = dict(parse_yaml(experiment)[0]["configurations"])
-        truths = {name for name, keys in asked.items() if keys.get("units") == TRUTH}
+        configurations = dict(parse_yaml(experiment)[0]["configurations"])
+        truths = {name for name, keys in configurations.items() if keys.get("units") == TRUTH}
     except (NotYamlError, AttributeError, TypeError, ValueError, KeyError):
-        asked, truths = {}, set()
-    asked = asked if set(names) <= set(asked) else dict.fromkeys(names)
-    colours = configuration_colours(asked, truths, shown=[name for name in asked if name in names])
+        configurations, truths = {}, set()
+    configurations = configurations if set(names) <= set(configurations) else dict.fromkeys(names)
+    colours = configuration_colours(configurations, truths, shown=[name for name in configurations if name in names])
     return {name: "#{:02x}{:02x}{:02x}".format(*colours[name]) for name in names}
 
 
@@ -117,14 +115,14 @@ def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
     shown = tuple(dict.fromkeys(compare)) or contents.configurations
     groups = [(name,) for name in shown] if not compare else [shown, *((name,) for name in shown)]
     scenes = {f"3D!{k}": _scene_panel(group, contents) for k, group in enumerate(groups)}
-    about = [_knowledge_panels(contents, shown, k) for k in range(len(contents.objects))]
+    lanes = [_knowledge_panels(contents, shown, k) for k in range(len(contents.objects))]
     rows = _arrange_grid(list(scenes))
     return {
-        "configById": {**scenes, **{key: panel for panels in about for key, panel in panels.items()}},
+        "configById": {**scenes, **{key: panel for panels in lanes for key, panel in panels.items()}},
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _stack_below(rows, about) if about else rows,
+        "layout": _stack_below(rows, lanes) if lanes else rows,
     }
 
 
@@ -166,20 +164,20 @@ def _title_settings(title: str) -> dict[str, str]:
     return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}
 
 
-def _scene_panel(configurations: Sequence[str], found: ReplayContents) -> dict[str, Any]:
+def _scene_panel(configurations: Sequence[str], contents: ReplayContents) -> dict[str, Any]:
     """A 3D panel of some configurations over the truth, whose camera follows the ego."""
     camera = {**EYE, "distance": DISTANCE_M, "target": [0, 0, 0], "targetOffset": [0, 0, 0],
               "targetOrientation": [0, 0, 0, 1]}  # fmt: skip
     shown = {f"{PREFIX}{name}/{kind}" for name in configurations for kind in ("scene", "uncertainty")}
-    every = [f"{PREFIX}{name}/{kind}" for name in found.configurations for kind in ("scene", "uncertainty")]
+    every = [f"{PREFIX}{name}/{kind}" for name in contents.configurations for kind in ("scene", "uncertainty")]
     drawn = {topic: {"visible": topic in shown} for topic in every}
-    truth = {topic: {"visible": True} for topic in TRUTH_TOPICS[:2]} if found.truth else {}
+    truth = {topic: {"visible": True} for topic in TRUTH_TOPICS[:2]} if contents.truth else {}
     grid = {"visible": True, "frameLocked": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid",
             "size": 200, "divisions": 20, "lineWidth": 1, "color": "#55555588"}  # fmt: skip
     return {
         **_title_settings(" and ".join(configurations)),
         "cameraState": camera,
-        **({"followTf": found.follow, "followMode": "follow-position"} if found.follow else {}),
+        **({"followTf": contents.follow, "followMode": "follow-position"} if contents.follow else {}),
         "scene": {"syncCamera": True, "transforms": {"visible": False}},
         "topics": {**truth, **drawn},
         "transforms": {},
@@ -187,11 +185,11 @@ def _scene_panel(configurations: Sequence[str], found: ReplayContents) -> dict[s
     }
 
 
-def _stack_below(scenes: Any, about: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _stack_below(scenes: Any, lanes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Lanes and curves in a strip under the scenes, a column per object; of one object they are side by side."""
-    way = "row" if len(about) == 1 else "column"
-    strip = split_panels("row", [split_panels(way, list(panels)) for panels in about])
-    return {"first": scenes, "second": strip, "direction": "column", "splitPercentage": 72 if len(about) == 1 else 58}
+    way = "row" if len(lanes) == 1 else "column"
+    strip = split_panels("row", [split_panels(way, list(panels)) for panels in lanes])
+    return {"first": scenes, "second": strip, "direction": "column", "splitPercentage": 72 if len(lanes) == 1 else 58}
 
 
 def _arrange_grid(panels: Sequence[str]) -> Any:

@@ -97,13 +97,13 @@ def _wall_tags(way: XmlNode) -> dict[str, str]:
 def _add_node(nodes: _Nodes, node: XmlNode, path: Path) -> None:
     """Add a node's places. Raises InputError: numbers that are none."""
     tags, ident = _tags(node), node.attributes.get("id", "")
-    up = _parse(tags.get("ele", "0"), "ele", node, path)
+    elevation = _parse(tags.get("ele", "0"), "ele", node, path)
     if "local_x" in tags and "local_y" in tags:
         x, y = (_parse(tags[name], name, node, path) for name in ("local_x", "local_y"))
-        nodes.local[ident] = (x, y, up)
+        nodes.local[ident] = (x, y, elevation)
     if "lat" in node.attributes or "lon" in node.attributes or ident not in nodes.local:
         lon, lat = (_parse(node.attributes.get(name), name, node, path) for name in ("lon", "lat"))
-        nodes.degrees[ident] = (lon, lat, up)
+        nodes.degrees[ident] = (lon, lat, elevation)
 
 
 def _parse(text: str | None, name: str, node: XmlNode, path: Path) -> float:

@@ -63,7 +63,7 @@ class _Reading:
     corners: int = 0
 
     def number(self, node: XmlNode, name: str, default: float | None = None) -> float:
-        """A number of an element. Raises InputError: none, where there is no default, or none that is in bounds."""
+        """A number of an element. Raises InputError: missing without a default, or out of bounds."""
         text = node.attributes.get(name, "")
         if not text.strip() and default is not None:
             return default
@@ -91,11 +91,11 @@ def read_embedded_map(path: Path, _heights_m: object = None) -> SiteMap:
     """The map that a recording has in it, as omega-prime writes it. Raises InputError, with the line of the map."""
     log, name = open_log(path), "open_drive_xml_content"
     maps = {c.number: c for c in log.channels if c.schema == EMBEDDED_MAP and c.messages}
-    found = log.attempt(lambda log: next(log.payloads(frozenset(maps)), None))
-    if found is None:
+    message = log.attempt(lambda log: next(log.payloads(frozenset(maps)), None))
+    if message is None:
         raise InputError(f"{path}: expected a map in the recording ({EMBEDDED_MAP}), found none")
     try:
-        columns = shred_messages(make_definition(maps[found[0]], [found[2]]), [found[2]], texts=[name]).levels[""]
+        columns = shred_messages(make_definition(maps[message[0]], [message[2]]), [message[2]], texts=[name]).levels[""]
     except (DefinitionError, KeyError) as error:
         raise InputError(f"{path}: the map in it cannot be read: {error}") from None
     return read_opendrive(path, content="".join(columns.texts[name].words).encode())
@@ -197,7 +197,7 @@ def _read_lanes(reading: _Reading, road: XmlNode, line: RoadLine, chord_m: float
         ((reading.number(node, "s"), node) for node in _children(road, "lanes", "laneSection")),
         key=lambda item: item[0],
     )
-    against = road.attributes.get("rule") == "LHT"
+    left_hand = road.attributes.get("rule") == "LHT"
     for k, (start, section) in enumerate(sections):
         end = min(line.length_m, sections[k + 1][0] if k + 1 < len(sections) else line.length_m)
         if not end - start > 1e-6:
@@ -219,7 +219,7 @@ def _read_lanes(reading: _Reading, road: XmlNode, line: RoadLine, chord_m: float
             s = line.sample(start, end, beside, breaks, chord_m)
             reading.spend(len(s) * (len(lanes) + 1), section)
             borders = line.place(s, beside(s))
-            _add_lanes(reading, road, k, lanes, borders, forward=(sign < 0) != against)
+            _add_lanes(reading, road, k, lanes, borders, forward=(sign < 0) != left_hand)
 
 
 def _read_lane(reading: _Reading, node: XmlNode, start: float) -> _LaneNode:
@@ -316,20 +316,22 @@ def _outline_prisms(reading: _Reading, node: XmlNode, line: RoadLine) -> Iterato
     raised_m = reading.number(node, "zOffset", 0.0)
     for outline in [*_children(node, "outlines", "outline"), *node.all("outline")]:
         if on_road := outline.all("cornerRoad"):
-            s, t, up, height = _columns(reading, on_road, ("s", "t", "dz", "height"))
+            s, t, above, height = _columns(reading, on_road, ("s", "t", "dz", "height"))
             points = line.place(s, t)
         else:
-            u, v, up, height = _columns(reading, outline.all("cornerLocal"), ("u", "v", "z", "height"))
-            at, heading = _place_object(reading, node, line)
+            u, v, above, height = _columns(reading, outline.all("cornerLocal"), ("u", "v", "z", "height"))
+            base, heading = _place_object(reading, node, line)
             cos, sin = math.cos(heading), math.sin(heading)
-            points = np.stack([at[0] + cos * u - sin * v, at[1] + sin * u + cos * v, at[2] + raised_m + 0 * u], -1)
+            points = np.stack(
+                [base[0] + cos * u - sin * v, base[1] + sin * u + cos * v, base[2] + raised_m + 0 * u], -1
+            )
         closed = outline.attributes.get("closed", "true") != "false"
         if len(points) < (3 if closed else 2):
             reading.counts["outline", "of too few corners: left out"] += 1
             continue
         if np.ptp(height) > 1e-6:
             reading.counts["outline", "with corners of several heights: the highest taken"] += 1
-        foot = points[:, 2] + up
+        foot = points[:, 2] + above
         bottom_m, top_m = float(foot.min()), float((foot + height).max())
         if closed:
             yield points[:, :2], bottom_m, top_m
@@ -350,15 +352,15 @@ def _columns(reading: _Reading, nodes: list[XmlNode], names: tuple[str, ...]) ->
 
 def _single_prism(reading: _Reading, node: XmlNode, line: RoadLine) -> list[_Prism]:
     """The octagon around an object's radius, or the box of its length and width."""
-    at, heading = _place_object(reading, node, line)
+    base, heading = _place_object(reading, node, line)
     length_m, width_m, height_m, radius_m = (
         reading.number(node, name, 0.0) for name in ("length", "width", "height", "radius")
     )
-    bottom_m = float(at[2]) + reading.number(node, "zOffset", 0.0)
+    bottom_m = float(base[2]) + reading.number(node, "zOffset", 0.0)
     if radius_m > 0.0:
-        return [(_octagon(at[:2], radius_m), bottom_m, bottom_m + height_m)]
+        return [(_octagon(base[:2], radius_m), bottom_m, bottom_m + height_m)]
     if length_m > 0.0 and width_m > 0.0:
-        return [(_turn_box(at[:2], heading, length_m, width_m), bottom_m, bottom_m + height_m)]
+        return [(_turn_box(base[:2], heading, length_m, width_m), bottom_m, bottom_m + height_m)]
     reading.counts["object", "without a size: left out"] += 1
     return []
 

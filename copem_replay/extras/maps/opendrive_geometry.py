@@ -64,7 +64,7 @@ class Piece:
 
     @property
     def sharpest_per_m(self) -> float:
-        """The largest curvature; of cubics one that nobody drives in a bend."""
+        """The largest curvature, 1/m; of cubics a value sharper than any bend that is driven."""
         bends = [abs(self.numbers[name]) for name in ("curvature", "curvStart", "curvEnd") if name in self.numbers]
         return max(bends, default=0.0 if self.shape == "line" else 0.1)
 
@@ -149,12 +149,12 @@ class RoadLine:
         which = np.clip(np.searchsorted(starts, s + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
         x, y, heading = np.empty((3, *s.shape))
         for k in np.unique(which):
-            piece, here = self.pieces[k], which == k
-            ahead, left, turn = piece.follow(s[here] - piece.s)
+            piece, in_piece = self.pieces[k], which == k
+            ahead, left, turn = piece.follow(s[in_piece] - piece.s)
             cos, sin = math.cos(piece.heading_rad), math.sin(piece.heading_rad)
-            x[here] = piece.x_m + cos * ahead - sin * left
-            y[here] = piece.y_m + sin * ahead + cos * left
-            heading[here] = piece.heading_rad + turn
+            x[in_piece] = piece.x_m + cos * ahead - sin * left
+            y[in_piece] = piece.y_m + sin * ahead + cos * left
+            heading[in_piece] = piece.heading_rad + turn
         return x, y, heading
 
     def place(self, s: Float, t: Float) -> Float:
@@ -166,29 +166,29 @@ class RoadLine:
         return np.stack([x - np.sin(heading) * level, y + np.cos(heading) * level, up], axis=-1)
 
     def sample(
-        self, start: float, end: float, beside: Callable[[Float], Float], breaks: Sequence[float] = (),
+        self, start: float, end: float, curves: Callable[[Float], Float], breaks: Sequence[float] = (),
         chord_m: float = CHORD_M,
     ) -> Float:  # fmt: skip
         """Places (K,) from `start` to `end`, at `breaks` and between, so that chords stay within `chord_m`.
 
-        `beside`: t (B, K) of curves at places (K,). A chord is held against a quarter, half and three quarters of
+        `curves`: t (B, K) of curves at places (K,). A chord is held against a quarter, half and three quarters of
         the way. Raises InputError: the road asks for too many places.
         """
         inner = [s for s in (*breaks, *(piece.s for piece in self.pieces)) if start < s < end]
         places = np.unique(np.array([start, *inner, end]))
-        most = _MOST_PLACES // len(beside(places[:1]))
+        most = _MOST_PLACES // len(curves(places[:1]))
         self._check_places(len(places), most)
         places = self._split_turns(places, most)
         open_ = np.ones(len(places) - 1, dtype=bool)
         while open_.any():
             first, last = places[:-1][open_], places[1:][open_]
-            far = self._is_far(first, last, beside, chord_m) & (last - first > 0.01)
-            new = ((first + last) / 2)[far]
+            is_far = self._is_far(first, last, curves, chord_m) & (last - first > 0.01)
+            new = ((first + last) / 2)[is_far]
             self._check_places(len(places) + len(new), most)
-            again = np.zeros(len(open_), dtype=bool)
-            again[np.flatnonzero(open_)[far]] = True
-            at = np.flatnonzero(again)
-            places, open_ = np.insert(places, at + 1, new), np.repeat(again, 1 + again)
+            is_split = np.zeros(len(open_), dtype=bool)
+            is_split[np.flatnonzero(open_)[is_far]] = True
+            split_ix = np.flatnonzero(is_split)
+            places, open_ = np.insert(places, split_ix + 1, new), np.repeat(is_split, 1 + is_split)
         return places
 
     def _check_places(self, number: float, most: int) -> None:
@@ -196,9 +196,7 @@ class RoadLine:
             raise InputError(f"{self.name}: expected at most {most:,} places along a section to follow it, found more")
 
     def _split_turns(self, places: Float, most: int) -> Float:
-        """Cut stretches longer than 100 m or that turn by more than a radian: a quarter of the way might be on a chord
-        again, some circles later.
-        """
+        """Cut stretches longer than 100 m or turning by over a radian: chords of full circles would look exact."""
         starts = np.array([piece.s for piece in self.pieces])
         which = np.clip(np.searchsorted(starts, places[:-1] + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
         bends = np.array([piece.sharpest_per_m for piece in self.pieces])[which]
@@ -207,16 +205,16 @@ class RoadLine:
         cut = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(places, places[1:], counts, strict=False)]
         return np.concatenate([*cut, places[-1:]])
 
-    def _is_far(self, first: Float, last: Float, beside: Callable[[Float], Float], chord_m: float) -> np.ndarray:
+    def _is_far(self, first: Float, last: Float, curves: Callable[[Float], Float], chord_m: float) -> np.ndarray:
         """Whether a curve leaves its chord, for stretches (K,)."""
-        a, b = (self.place(s, beside(s)) for s in (first, last))
+        a, b = (self.place(s, curves(s)) for s in (first, last))
         along = b - a
         length2 = np.maximum((along**2).sum(axis=-1), 1e-18)
-        far = np.zeros(len(first), dtype=bool)
+        is_far = np.zeros(len(first), dtype=bool)
         for share in (0.25, 0.5, 0.75):
             s = first + share * (last - first)
-            off = self.place(s, beside(s)) - a
-            on = np.clip((off * along).sum(axis=-1) / length2, 0.0, 1.0)
-            distance2 = ((off - on[..., None] * along) ** 2).sum(axis=-1)
-            far |= (distance2 > chord_m**2).reshape(-1, len(first)).any(axis=0)
-        return far
+            offset = self.place(s, curves(s)) - a
+            along_share = np.clip((offset * along).sum(axis=-1) / length2, 0.0, 1.0)
+            distance2 = ((offset - along_share[..., None] * along) ** 2).sum(axis=-1)
+            is_far |= (distance2 > chord_m**2).reshape(-1, len(first)).any(axis=0)
+        return is_far

@@ -43,7 +43,7 @@ class OsmData:
     licence: str = ""
 
     def add_geometry(self, way: str, points: Sequence[Place | None]) -> None:
-        """Add a way of which places are known, not nodes, unless it is there; None: a place that was cut off."""
+        """Add a way by its places instead of nodes, unless it is there; None: a place that was cut off."""
         names = [f"{place[0]!r} {place[1]!r}" for place in points if place is not None]
         self.places.update(zip(names, (place for place in points if place is not None), strict=True))
         self.ways.setdefault(way, (names if None not in points else ["", *names], {}))

@@ -94,7 +94,7 @@ def _open_candidate(path: Path) -> _Candidate:
 
 
 def read_json(path: Path) -> Any:
-    """What a file of JSON holds. Raises InputError with file and line; NaN and Infinity are no JSON."""
+    """The content of a JSON file. Raises InputError with file and line; NaN and Infinity are no JSON."""
     try:
         size = path.stat().st_size
         if size > _MOST_BYTES:

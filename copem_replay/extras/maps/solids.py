@@ -71,14 +71,14 @@ def check_place(lon: object, lat: object, where: str) -> Place:
 
 
 def tag_text(value: object) -> str:
-    """A value of JSON as the text of a tag: numbers as they are, true as yes, none and false as no."""
+    """The text of a tag from a JSON value: numbers as they are, true as yes, none and false as no."""
     if value is None or isinstance(value, bool):
         return "yes" if value else "no"
     return str(value)
 
 
 def parse_metres(text: str | None) -> float | None:
-    """A length: `12`, `12.5 m`, `40 ft`, `12'6"`; None: it says none."""
+    """The metres of a length: `12`, `12.5 m`, `40 ft`, `12'6"`; None: it is none."""
     said = (text or "").strip().replace(",", ".")
     if found := re.fullmatch(r"(\d{1,9}(?:\.\d*)?)\s*(m|metres?|meters?|ft|feet)?", said):
         metres = float(found[1]) * (_FOOT_M if found[2] in ("ft", "feet") else 1.0)
@@ -90,7 +90,7 @@ def parse_metres(text: str | None) -> float | None:
 
 
 def hides(tags: Tags) -> bool:
-    """Whether a shape hides what is behind it: a building above the ground, or a barrier that is not seen through."""
+    """Whether a shape blocks the view: a building above the ground, or an opaque barrier."""
     if tags.get("location") == "underground" or _number(tags.get("layer")) < 0.0:
         return False
     building = any(tags.get(name, "no") != "no" for name in ("building", "building:part"))
@@ -116,13 +116,13 @@ def make_site(
     """
     import shapely
 
-    wanted = [shape for shape in shapes if hides(shape.tags) and not shape.geometry.is_empty]
-    if not wanted:
+    hiding = [shape for shape in shapes if hides(shape.tags) and not shape.geometry.is_empty]
+    if not hiding:
         return SiteMap(degrees=degrees, assumed=_list_counts(counts), licence=licence)
-    middle = np.median(shapely.get_coordinates([shape.geometry for shape in wanted]), axis=0)
+    middle = np.median(shapely.get_coordinates([shape.geometry for shape in hiding]), axis=0)
     scale = _metres_per_degree(float(middle[1])) if degrees else np.ones(2)
     blocks = list[_Block]()
-    for shape in wanted:
+    for shape in hiding:
         geometry = shapely.transform(shape.geometry, lambda places: (places - middle) * scale)
         blocks += _make_blocks(shape._replace(geometry=geometry), heights_m, counts)
     solids = [_make_map_solid(block) for block in _cut_outlines(blocks, counts)]
@@ -216,13 +216,13 @@ def _cut_outlines(blocks: Sequence[_Block], counts: Counter[str]) -> Iterator[_B
         inside = (
             [parts[k] for k in tree.query(block.footprint, predicate="intersects")] if block.role == "outline" else []
         )
-        rest = block.footprint.difference(shapely.union_all(inside)) if inside else block.footprint
-        if rest.area > block.footprint.area - 0.5:
+        remainder = block.footprint.difference(shapely.union_all(inside)) if inside else block.footprint
+        if remainder.area > block.footprint.area - 0.5:
             yield block
             continue
-        rest = rest.buffer(-_SLIVER_M / 2).buffer(_SLIVER_M / 2, join_style="mitre")
+        remainder = remainder.buffer(-_SLIVER_M / 2).buffer(_SLIVER_M / 2, join_style="mitre")
         counts["outline of a building with parts: what they leave is taken"] += 1
-        for piece in shapely.get_parts(rest):
+        for piece in shapely.get_parts(remainder):
             if piece.geom_type == "Polygon" and piece.area > _LEAST_REST_M2:
                 yield block._replace(footprint=piece)
 

@@ -57,14 +57,14 @@ class Grid:
     unit_m: float
 
     def round_places(self, rows: Rows) -> Int:
-        """(R, 3) places and headings as whole numbers of 16 bits."""
-        turned = np.rint(rows.yaw_rad / np.pi * FULL_TURN).astype(np.int64)
-        turned = (turned + FULL_TURN) % (2 * FULL_TURN) - FULL_TURN
+        """(R, 3) places and headings as 16-bit integers."""
+        heading = np.rint(rows.yaw_rad / np.pi * FULL_TURN).astype(np.int64)
+        heading = (heading + FULL_TURN) % (2 * FULL_TURN) - FULL_TURN
         east, north = (
             np.clip(np.rint((at - of) / self.unit_m), -32_767, 32_767).astype(np.int64)
             for at, of in ((rows.x_m, self.middle_m[0]), (rows.y_m, self.middle_m[1]))
         )
-        return np.stack([east, north, turned], axis=1)
+        return np.stack([east, north, heading], axis=1)
 
 
 @dataclass(frozen=True)
@@ -78,16 +78,16 @@ class Rows:
     yaw_rad: Float
 
     def take(self, rows: Any) -> Rows:
-        """Some of the rows."""
+        """The rows at these indices or in this mask."""
         return Rows(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def find_rows(tracks: Tracks, available_s: Float, instants_s: Float, kept: Bool | None = None) -> Rows:
+def find_rows(tracks: Tracks, available_s: Float, instants_s: Float, is_taken: Bool | None = None) -> Rows:
     """The newest list of `tracks`, of one run, at each instant (K,). `available_s`: when each list is there, (F,).
 
-    `kept (P,)`: which rows are taken, None: all that are valid.
+    `is_taken (P,)`: which rows are taken, None: all that are valid.
     """
-    kept = tracks.valid[0] if kept is None else kept
+    is_taken = tracks.valid[0] if is_taken is None else is_taken
     by_time = np.argsort(available_s, kind="stable")
     newest = np.searchsorted(available_s[by_time], instants_s + SAME_INSTANT_S, side="right") - 1
     frame = np.flatnonzero(newest >= 0)
@@ -96,7 +96,7 @@ def find_rows(tracks: Tracks, available_s: Float, instants_s: Float, kept: Bool 
     count = bounds[lists + 1] - bounds[lists]
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     rows, frame = order[np.repeat(bounds[lists], count) + within], np.repeat(frame, count)
-    rows, frame = rows[kept[rows]], frame[kept[rows]]
+    rows, frame = rows[is_taken[rows]], frame[is_taken[rows]]
     return Rows(frame, tracks.row_object_ix[rows], tracks.x_m[0, rows], tracks.y_m[0, rows], tracks.yaw_rad[0, rows])
 
 
@@ -128,7 +128,7 @@ def write_section(study: ReportData) -> tuple[str, list[Html]] | None:
 
 
 def player_element(study: ReportData) -> Html | None:
-    """The player of a run with its data; words where the log cannot be replayed again; None where no run is shown."""
+    """The player of a run with its data, or words where the log cannot be replayed; None where no run is shown."""
     results, shown = study.results, study.results.provenance.run_shown
     colours = {name: look.dark for name, look in study.looks.items()}
     names = find_differing(results, study.contenders, MOST_CONFIGURATIONS, colours)
@@ -145,22 +145,22 @@ def player_element(study: ReportData) -> Html | None:
 
 
 def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
-    """What `player.js` draws of one run. Raises CopemError where the log cannot be read or replayed again."""
+    """The data of one run for `player.js`. Raises CopemError where the log cannot be read or replayed again."""
     results = study.results
-    asked = resolve_for_log(results.experiment, choice.log)
-    chosen = list(choice.configurations)
-    replayed, its_rows = replay_again(results, choice.log, choice.run, chosen)
+    experiment = resolve_for_log(results.experiment, choice.log)
+    names = list(choice.configurations)
+    replayed, its_rows = replay_again(results, choice.log, choice.run, names)
     (rows,) = results.each(log=choice.log, every=True)
     of_run, table = first_episodes(rows[rows["run"] == choice.run]), first_episodes(its_rows)
     scene, truth = replayed.replay.scene, replayed.replay.truth
-    shown = [scene.object_ids[k] for k in choose_shown_objects(scene, truth, asked, of_run).object_ix]
+    shown = [scene.object_ids[k] for k in choose_shown_objects(scene, truth, experiment, of_run).object_ix]
     measured = _list_measured(scene, table, shown)
     onset_s = measured[0][1]
     begin_s = 0.0 if scene.end_s <= LONGEST_S else max(0.0, onset_s - BEFORE_S)
     instants_s = np.arange(begin_s, min(scene.end_s, begin_s + LONGEST_S) + STEP_S / 2, STEP_S)
     tracks = {"": find_rows(truth, truth.captured_s, instants_s), **_find_fused(replayed, instants_s)}
     grid, tracks = _fit_frames(tracks, instants_s)
-    ranked = sort_soonest_first(results, chosen)
+    ranked = sort_soonest_first(results, names)
     return {
         "log": choice.log,
         "run": choice.run,
@@ -185,26 +185,26 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
                 "false": _to_text(encode_false(tracks[name], grid)),
                 "known": _list_known(scene, table, name),
             }
-            for name in chosen
+            for name in names
         ],
-        "shown": [chosen.index(name) for name in dict.fromkeys((ranked[-1], ranked[0]))],
+        "shown": [names.index(name) for name in dict.fromkeys((ranked[-1], ranked[0]))],
     }
 
 
 def _find_fused(replayed: ReplayedRun, instants_s: Float) -> dict[str, Rows]:
     """Rows of each configuration; of each frame those of the last time chunk that has a list by then."""
-    found: dict[str, Rows] = {}
+    rows_of: dict[str, Rows] = {}
     for chunk in replayed.run_tracks:
         for name, fused_tracks in chunk.items():
             rows, has_list = _find_in_chunk(replayed, fused_tracks, instants_s)
-            if name in found:
-                before = found[name].take(~has_list[found[name].frame])
+            if name in rows_of:
+                before = rows_of[name].take(~has_list[rows_of[name].frame])
                 pairs = ((getattr(before, column), getattr(rows, column)) for column in rows.__dataclass_fields__)
                 rows = Rows(*map(np.concatenate, pairs))
-            found[name] = rows
+            rows_of[name] = rows
         if min(of.fused.common_arrives_s.min(initial=np.inf) for of in chunk.values()) > instants_s[-1]:
             break
-    return found
+    return rows_of
 
 
 def _find_in_chunk(replayed: ReplayedRun, fused_tracks: FusedTracks, instants_s: Float) -> tuple[Rows, Any]:
@@ -219,17 +219,17 @@ def _find_in_chunk(replayed: ReplayedRun, fused_tracks: FusedTracks, instants_s:
 
 def _fit_frames(tracks: dict[str, Rows], instants_s: Float) -> tuple[Grid, dict[str, Rows]]:
     """The grid of every so many frames, the most that take `MOST_BYTES` in the page, and the rows in them."""
-    every = 1
+    stride = 1
     while True:
-        kept = {name: rows.take(rows.frame % every == 0) for name, rows in tracks.items()}
-        if sum(len(rows.frame) for rows in kept.values()) * 8 <= MOST_BYTES or every >= len(instants_s):
+        thinned = {name: rows.take(rows.frame % stride == 0) for name, rows in tracks.items()}
+        if sum(len(rows.frame) for rows in thinned.values()) * 8 <= MOST_BYTES or stride >= len(instants_s):
             break
-        every += 1
-    kept = {name: Rows(rows.frame // every, *list(vars(rows).values())[1:]) for name, rows in kept.items()}
-    x, y = (np.concatenate([getattr(rows, name) for rows in kept.values()]) for name in ("x_m", "y_m"))
+        stride += 1
+    thinned = {name: Rows(rows.frame // stride, *list(vars(rows).values())[1:]) for name, rows in thinned.items()}
+    x, y = (np.concatenate([getattr(rows, name) for rows in thinned.values()]) for name in ("x_m", "y_m"))
     middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2) if len(x) else (0.0, 0.0)
     farthest = max(np.ptp(x), np.ptp(y)) / 2 if len(x) else 0.0
-    return Grid(instants_s[::every], middle, max(STEP_M, float(np.ceil(farthest / 327) / 100))), kept
+    return Grid(instants_s[::stride], middle, max(STEP_M, float(np.ceil(farthest / 327) / 100))), thinned
 
 
 def _to_text(content: bytes) -> str:
@@ -287,11 +287,11 @@ def _list_measured(scene: Scene, table: pd.DataFrame, shown: Sequence[str]) -> l
     """Measured objects, those that the viewer shows first, the rest by how much they tell apart: onset and end (s)."""
     time_s = table["time_to_detection_s"].fillna(table["ended_s"] - table["onset_s"])
     apart = time_s.groupby(table["object_id"], sort=False).agg(np.ptp)
-    once = table.drop_duplicates("object_id").set_index("object_id")
+    episodes = table.drop_duplicates("object_id").set_index("object_id")
     rest = [name for name in apart.index if name not in shown]
     ranked = [name for name in shown if name in apart.index] + sorted(rest, key=lambda name: -round(apart[name], 6))
     return [
-        [scene.object_number[name], *once.loc[name, ["onset_s", "ended_s"]].astype(float).round(6).tolist()]
+        [scene.object_number[name], *episodes.loc[name, ["onset_s", "ended_s"]].astype(float).round(6).tolist()]
         for name in ranked
     ]
 
@@ -332,7 +332,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
         "div", make_tag("button", "play", type="button", class_="play"), slider, make_tag("output", "0.0 s"),
         class_="controls screen",
     )  # fmt: skip
-    written = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    json_text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     script = (files("copem_replay.extras.player") / "player.js").read_text(encoding="utf-8")
     return join_html(
         [
@@ -342,7 +342,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
                 make_tag("p", make_tag("code", class_="command"), class_="below"),
                 id_="player", tabindex="0", role="group", aria_label="Player of a run",
             ),
-            make_tag("script", Html(written), type="application/json", id_="played"),
+            make_tag("script", Html(json_text), type="application/json", id_="played"),
             make_tag("script", Html(script)),
         ]
     )  # fmt: skip

@@ -46,19 +46,19 @@ def story_parts(study: ReportData) -> list[Html]:
     except RecordingError:
         return [make_tag("p", f"No plans of {log}: {NO_RECORDING}.")]
     chosen, too_short = choose_stories(drive, table, rows)
-    told = {name: first_episodes(rows[rows["object_id"] == name]) for name in chosen}
-    spans = find_spans(study, drive, run, told)
-    said = (
+    episodes_of = {name: first_episodes(rows[rows["object_id"] == name]) for name in chosen}
+    spans = find_spans(study, drive, run, episodes_of)
+    intro = (
         f"Run {run} of {log}: the objects that copem-replay view shows. First are those that configurations know at "
         "the most different times, near the way of the ego."
     )
     named = ", ".join(too_short[:_NAMED]) + (", …" if len(too_short) > _NAMED else "")
     short = f" Too short to judge, seen for less than 2 s before or after it counts: {named}" if too_short else ""
     short += "." if short and not short.endswith("…") else ""
-    parts = [make_tag("p", said + short)]
-    if told and not any(spans.values()):
+    parts = [make_tag("p", intro + short)]
+    if episodes_of and not any(spans.values()):
         parts.append(make_tag("p", "What becomes of lists is not told: the run cannot be replayed again as it was."))
-    for name, of in told.items():
+    for name, of in episodes_of.items():
         parts.append(_story_element(ObjectStory(study, drive, of, spans[name])))
     return parts
 
@@ -100,12 +100,12 @@ def _name_difference(story: ObjectStory) -> str:
 
 
 def _story_element(story: ObjectStory) -> Html:
-    hider, said = story.hider, explain_story(story)
+    hider, words = story.hider, explain_story(story)
     title = make_tag("h3", f"{story.name}: {_name_difference(story)}")
     log, command = story.drive.log, story.study.view_command(story.drive.log, story.object_id)
-    beside = [" ", link_player(log, story.object_id), *([" ", make_tag("code", command)] if command else [])]
+    links = [" ", link_player(log, story.object_id), *([" ", make_tag("code", command)] if command else [])]
     figure = make_tag(
-        "div", draw_story(story, hider, said), class_="scroll", tabindex="0", role="region", aria_label=story.name
+        "div", draw_story(story, hider, words), class_="scroll", tabindex="0", role="region", aria_label=story.name
     )
     helps = tell_what_helps(story.drive.experiment, story.rows)
     late = why_late(read_why(story.study.results), story.drive.log, story.object_id, story.onset_s)
@@ -114,6 +114,6 @@ def _story_element(story: ObjectStory) -> Html:
     causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
     causes = [make_tag("p", helps), *causes] if helps else causes
     return make_tag(
-        "div", title, make_tag("p", said, *beside), *causes, figure, class_="told", id_=story_id(log, story.object_id),
+        "div", title, make_tag("p", words, *links), *causes, figure, class_="told", id_=story_id(log, story.object_id),
         data_log=log, data_story=story.object_id,
     )  # fmt: skip

@@ -42,7 +42,7 @@ class ObjectStory:
 
     @property
     def name(self) -> str:
-        """`pedestrian 61`."""
+        """The class and id of the object: `pedestrian 61`."""
         return f"{self.rows['object_class'].iloc[0]} {self.object_id}"
 
     @property
@@ -62,7 +62,7 @@ class ObjectStory:
 
     @property
     def first(self) -> Any:
-        """The row of the configuration that knows it first; of equal ones the first."""
+        """The row of the configuration that knows it first; of equals the first one."""
         return self.rows.loc[self.rows["unknown_s"].idxmin()]
 
     @property
@@ -71,7 +71,7 @@ class ObjectStory:
         return self.rows.loc[self.rows["unknown_s"].idxmax()]
 
     def known_s(self, row: Any) -> float:
-        """When a configuration knows it; when its episode ends, if it never does."""
+        """The time from which a configuration knows it; the end of its episode, if it never does."""
         return float(row["detection_s"] if row["detected"] else row["ended_s"])
 
     @property
@@ -94,31 +94,31 @@ def _is_told(span: StatusSpan) -> bool:
 
 
 def find_spans(
-    study: ReportData, drive: Drive, run: int, told: Mapping[str, pd.DataFrame]
+    study: ReportData, drive: Drive, run: int, episodes_of: Mapping[str, pd.DataFrame]
 ) -> dict[str, dict[str, list[StatusSpan]]]:
-    """The status of each object of `told` in a run until it is known, by object and configuration.
+    """The status of each object of `episodes_of` in a run until it is known, by object and configuration.
 
     None where the run cannot be replayed again, or comes out otherwise.
     """
-    names = list(dict.fromkeys(name for rows in told.values() for name in rows["configuration"]))
+    names = list(dict.fromkeys(name for rows in episodes_of.values() for name in rows["configuration"]))
     try:
         replayed, table = replay_again(study.results, drive.log, run, names)
-        collector = TrackCollector([drive.scene.object_number[name] for name in told])
+        collector = TrackCollector([drive.scene.object_number[name] for name in episodes_of])
         for chunk in replayed.run_tracks:
             collector.add(chunk)
     except CopemError:
-        return {name: {} for name in told}
+        return {name: {} for name in episodes_of}
     replay, experiment, shown = replayed.replay, replayed.experiment, collector.object_ix.tolist()
-    sight, found = compute_sight(replay, experiment, shown), dict[str, dict[str, list[StatusSpan]]]()
+    sight, spans = compute_sight(replay, experiment, shown), dict[str, dict[str, list[StatusSpan]]]()
     for configuration, tracks in collector.whole().items():
         clock = read_episode_clocks(drive.scene, first_episodes(table), configuration)
         statuses = compute_status(replay, experiment, configuration, tracks, sight, clock)
-        for m, (name, rows) in enumerate(told.items()):
-            of = found.setdefault(name, {})
+        for m, (name, rows) in enumerate(episodes_of.items()):
+            of = spans.setdefault(name, {})
             for _, row in rows[rows["configuration"] == configuration].iterrows():
                 until_s = row["detection_s"] if row["detected"] else row["ended_s"]
                 of[configuration] = list_status_spans(replay, sight, statuses, m, row["onset_s"], until_s)
-    return found
+    return spans
 
 
 def world_at(drive: Drive, time_s: float) -> Tracks:
@@ -136,7 +136,7 @@ def unit_pose(drive: Drive, name: str, unit: Unit, world: Tracks) -> UnitPoses:
 
 
 def explain_story(story: ObjectStory) -> str:
-    """What the last configuration had of an object until it knew it, and what the first one had, in one sentence."""
+    """One sentence on how the last configuration came to know an object, and how the first one did."""
     first, last = story.first, story.last
     told = [last, first] if last["unknown_s"] - first["unknown_s"] > SAME_INSTANT_S else [last]
     return "; ".join(f"{row['configuration']}: {', '.join(_tell_row(story, row))}" for row in told) + "."

@@ -38,10 +38,10 @@ _MARGIN_M = 6.0
 """Bodies whose middle is so far outside a plan may still reach into it."""
 
 
-def draw_story(story: ObjectStory, hider: StatusSpan | None, said: str) -> Html:
-    """The picture of a story; `said`: its sentence, for screen readers."""
+def draw_story(story: ObjectStory, hider: StatusSpan | None, words: str) -> Html:
+    """The picture of a story; `words`: its sentence, for screen readers."""
     picture = make_tag(
-        "svg", *_draw_plans(story, hider), *_draw_lanes(story), class_="story", role="img", aria_label=said,
+        "svg", *_draw_plans(story, hider), *_draw_lanes(story), class_="story", role="img", aria_label=words,
         viewBox=f"0 0 {_WIDTH} {_HEIGHT}",
     )  # fmt: skip
     return Html(replace_greys(replace_colours(picture, story.study.looks.values())))
@@ -91,15 +91,15 @@ def _draw_plans(story: ObjectStory, hider: StatusSpan | None) -> Iterator[Html]:
 def _choose_box(story: ObjectStory, worlds: Sequence[Tracks], hider: StatusSpan | None) -> tuple[float, float, float]:
     """West and north end (m) and width (m) of the plans: the object, what hides it, and the ego, if it is near."""
     drive, number = story.drive, story.drive.scene.object_number[story.object_id]
-    own = np.concatenate([_places(world, number) for world in worlds])
-    kept = [own]
-    others = [
+    object_m = np.concatenate([_places(world, number) for world in worlds])
+    places = [object_m]
+    other_places = [
         _places(world, k) for world in worlds for k in (drive.scene.ego_ix, hider.body_ix if hider else -1) if k >= 0
     ]
     units = [np.array([at]) for at in drive.fixed_units().values()]
-    if len(own):
-        kept += [at for at in (*others, *units) if len(at) and np.hypot(*(at - own[0]).T).min() <= _NEAR_M]
-    at_m = np.concatenate(kept) if len(own) else np.concatenate([*others, *units, np.zeros((1, 2))])
+    if len(object_m):
+        places += [at for at in (*other_places, *units) if len(at) and np.hypot(*(at - object_m[0]).T).min() <= _NEAR_M]
+    at_m = np.concatenate(places) if len(object_m) else np.concatenate([*other_places, *units, np.zeros((1, 2))])
     low, high = at_m.min(axis=0), at_m.max(axis=0)
     width_m = max(high[0] - low[0] + 10, (high[1] - low[1] + 10) * _PLAN_W / _PLAN_H, _SPAN_M)
     west, south = (high + low) / 2 - np.array([width_m, width_m * _PLAN_H / _PLAN_W]) / 2
@@ -151,9 +151,9 @@ def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tu
     Above, below, right or left of its body, a name is clear of all of them and of other names, if there is such a place
     in the plan.
     """
-    taken = [(corners.min(axis=0), corners.max(axis=0)) for _, corners in bodies]
+    covered = [(corners.min(axis=0), corners.max(axis=0)) for _, corners in bodies]
     frame = np.array([left, _TOP]), np.array([left + _PLAN_W, _TOP + _PLAN_H])
-    for (name, _), ((west, north), (east, south)) in zip(bodies, list(taken), strict=True):
+    for (name, _), ((west, north), (east, south)) in zip(bodies, list(covered), strict=True):
         half, x, y = _LETTER * len(name) / 2, (west + east) / 2, (north + south) / 2
         spots = [(x, north - 4), (x, south + 12), (east + half + 4, y + 4), (west - half - 4, y + 4)]
         areas = [(np.array([x - half, y - 10]), np.array([x + half, y + 2])) for x, y in spots]
@@ -161,10 +161,10 @@ def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tu
             k
             for k, (low, high) in enumerate(areas)
             if (low >= frame[0]).all() and (high <= frame[1]).all()
-            and not any((low < other_high).all() and (high > other_low).all() for other_low, other_high in taken)
+            and not any((low < other_high).all() and (high > other_low).all() for other_low, other_high in covered)
         ]  # fmt: skip
         k = free[0] if free else 0
-        taken.append(areas[k])
+        covered.append(areas[k])
         yield name, *spots[k]
 
 
@@ -200,8 +200,8 @@ _SHADES = {"out of range or view": _OUT, "hidden": _HIDDEN, "in sight": _IN_SIGH
 
 def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
     rows = story.rows.sort_values("unknown_s", kind="stable")
-    kept = pick_evenly([str(name) for name in rows["configuration"]], _LANES)
-    rows = rows[rows["configuration"].isin(kept)]
+    lane_names = pick_evenly([str(name) for name in rows["configuration"]], _LANES)
+    rows = rows[rows["configuration"].isin(lane_names)]
     last_s = max(story.known_s(row) for _, row in rows.iterrows()) - story.onset_s
     scale = (_WIDTH - _LANE_LEFT - 60) / max(1.15 * last_s, JUDGED_S)
     each = min(18.0, 84 / len(rows))
@@ -209,7 +209,7 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
         yield from _draw_lane(story, row, _LANES_TOP + k * each, each - 4, scale)
     y = _LANES_TOP + len(rows) * each + 12
     x = float(_LANE_LEFT)
-    unlisted = any(span.status == NO_UNIT for name in kept for span in story.spans.get(name, ()))
+    unlisted = any(span.status == NO_UNIT for name in lane_names for span in story.spans.get(name, ()))
     shades = _SHADES | ({"not listed": _UNLISTED} if unlisted else {})
     for word, shade in (*shades.items(), ("thick: known (in the colour of the configuration)", None)):
         if shade:

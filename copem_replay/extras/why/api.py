@@ -74,16 +74,16 @@ class Explanation:
         return [place / name for name in self.files]
 
     def blocks(self, width: int | None = None) -> Iterator[list[str]]:
-        """What is said in the terminal, part by part. `width`: None for a pipe."""
+        """The text for the terminal, part by part. `width`: None for a pipe."""
         if self.causes is not None:
-            for name, of in self.causes.groupby("configuration", sort=False):
-                yield _describe_causes(str(name), of, width)
+            for name, rows in self.causes.groupby("configuration", sort=False):
+                yield _describe_causes(str(name), rows, width)
         if self.units is not None:
-            for name, of in self.units.groupby("configuration", sort=False):
-                yield _describe_units(str(name), of, width)
+            for name, rows in self.units.groupby("configuration", sort=False):
+                yield _describe_units(str(name), rows, width)
         if self.triage is not None and self.late is not None:
-            for name, of in self.triage.groupby("configuration", sort=False):
-                yield _describe_groups(str(name), of)
+            for name, rows in self.triage.groupby("configuration", sort=False):
+                yield _describe_groups(str(name), rows)
             if not len(self.triage):
                 yield ["no object is unknown for more than 1 s in one run of twenty or more"]
             yield from _describe_hopeless(self.late)
@@ -133,17 +133,17 @@ def why(
 
 
 def _load_logs(
-    given: AnyExperiment | Results, recordings: AnyRecordings | None
+    source: AnyExperiment | Results, recordings: AnyRecordings | None
 ) -> tuple[Experiment, list[tuple[Recording, Experiment]]]:
     """An experiment, and its recordings with the experiment of each; of results those that were replayed."""
-    if isinstance(given, str | PathLike) and Path(given).is_dir():
-        given = open_results(Path(given))
-    if isinstance(given, Results):
+    if isinstance(source, str | PathLike) and Path(source).is_dir():
+        source = open_results(Path(source))
+    if isinstance(source, Results):
         if recordings is not None:
-            raise InputError(f"{given.place}: expected its own recordings, found others; an experiment takes them")
-        of = [(one.name, resolve_for_log(given.experiment, one.name)) for one in given.provenance.logs]
-        return given.experiment, [(given.recording(name, alone), alone) for name, alone in of]
-    study = make_study(given, recordings)
+            raise InputError(f"{source.place}: expected its own recordings, found others; an experiment takes them")
+        log_experiments = [(one.name, resolve_for_log(source.experiment, one.name)) for one in source.provenance.logs]
+        return source.experiment, [(source.recording(name, alone), alone) for name, alone in log_experiments]
+    study = make_study(source, recordings)
     check_any_counted(study)
     return study.experiment, [(one, resolve_for_log(study.experiment, one.scene.log)) for one in study.recordings]
 
@@ -175,10 +175,10 @@ class _Question:
         with_units = [n for n, one in experiment.configurations.items() if one.units != TRUTH and one.recorded is None]
         return list(dict.fromkeys(self.configurations or with_units))
 
-    def note(self, part: str, errors: Sequence[ExperimentError], found: bool) -> Iterator[str]:
-        """Why a part is left out. Raises what was asked for by name and cannot be had."""
+    def note(self, part: str, errors: Sequence[ExperimentError], has_tables: bool) -> Iterator[str]:
+        """The reason why a part is left out. Raises it where the part was requested by name."""
         for error in errors:
-            if self.configurations is not None and (self.asked_parts is not None or not found):
+            if self.configurations is not None and (self.asked_parts is not None or not has_tables):
                 raise error
             yield f"no {part}: {error}"
 
@@ -189,31 +189,31 @@ def _explain(
     question: _Question,
     progress: Callable[[int, int], None],
 ) -> Explanation:
-    """`experiment`: over all logs; those that lack a configuration's units have no part in it."""
+    """The tables of the requested parts, and notes. `experiment`: over all logs; some may lack a configuration."""
     notes, tables = list[str](), {part: list[pd.DataFrame]() for part in (*PARTS, "late")}
-    known: dict[str, pd.DataFrame] = {}
-    beside: dict[int, Counterfactuals] = {}
+    rows_of: dict[str, pd.DataFrame] = {}
+    latest: dict[int, Counterfactuals] = {}
     names, parts = question.select(experiment), question.parts
     if experiment.runs < _FEW_RUNS:
         few = count_noun(experiment.runs, "run")
         notes.append(f"{few}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
     steps = len(names) + ("sensitivity" in parts)
     for k, name in enumerate(names):
-        having = _select_logs(logs, [name])
-        if 0 < len(having) < len(logs):
-            of = ", ".join(recording.scene.log for recording, _ in having.values())
-            notes.append(f"{name}: of {of} alone; other logs lack its units")
-        found = _explain_configuration(name, having, question, beside)
-        for part, table in found.tables.items():
+        its_logs = _select_logs(logs, [name])
+        if 0 < len(its_logs) < len(logs):
+            log_names = ", ".join(recording.scene.log for recording, _ in its_logs.values())
+            notes.append(f"{name}: of {log_names} alone; other logs lack its units")
+        explained = _explain_configuration(name, its_logs, question, latest)
+        for part, table in explained.tables.items():
             tables[part].append(table.assign(configuration=name)[["configuration", *table.columns]])
-        for part, error in found.errors.items():
-            notes += question.note(part, [error], bool(found.tables))
-        if found.rows is not None:
-            known[name] = found.rows
+        for part, error in explained.errors.items():
+            notes += question.note(part, [error], bool(explained.tables))
+        if explained.rows is not None:
+            rows_of[name] = explained.rows
         progress(k + 1, steps)
     joined = {part: pd.concat(of, ignore_index=True) for part, of in tables.items() if of}
     common = list(_select_logs(logs, names).values())
-    varied, orders, why_not = _vary(common, names, known) if common and "sensitivity" in parts else (None, None, [])
+    varied, orders, why_not = _vary(common, names, rows_of) if common and "sensitivity" in parts else (None, None, [])
     notes += question.note("sensitivity", why_not, bool(joined))
     progress(steps, steps)
     if not joined and varied is None:
@@ -251,37 +251,37 @@ class _PartTables(NamedTuple):
 
 
 def _explain_configuration(
-    name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, beside: dict[int, Counterfactuals]
+    name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, latest: dict[int, Counterfactuals]
 ) -> _PartTables:
-    """`logs`: by number; `beside`: likewise the replays of the configuration before, which are replaced."""
+    """`logs`: by number; `latest`: likewise the replays of the configuration before, which are replaced."""
     from copem_replay.extras.why.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.extras.why.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.extras.why.worth import compute_unit_worths
 
-    parts, found = question.parts, _PartTables({}, {})
+    parts, result = question.parts, _PartTables({}, {})
     if {"causes", "triage"} & set(parts):
         shares: list[tuple[Counterfactuals, list[CauseShares]]] = []
         try:
             for k, (recording, experiment) in logs.items():
-                beside[k] = replays = Counterfactuals(recording, experiment, name, beside.get(k))
+                latest[k] = replays = Counterfactuals(recording, experiment, name, latest.get(k))
                 shares.append((replays, share_lateness(replays)))
         except ExperimentError as error:
-            found.errors["causes"] = error
+            result.errors["causes"] = error
         else:
-            found = found._replace(rows=pd.concat([replays.rows for replays, _ in shares], ignore_index=True))
+            result = result._replace(rows=pd.concat([replays.rows for replays, _ in shares], ignore_index=True))
             if "causes" in parts:
-                found.tables["causes"] = tabulate_causes(shares)
+                result.tables["causes"] = tabulate_causes(shares)
             if "triage" in parts:
                 groups, episodes = zip(*(group_late_episodes(*of_log) for of_log in shares), strict=True)
                 some = [of for of in groups if len(of)] or groups[:1]
-                found.tables["triage"] = rank_groups(pd.concat(some, ignore_index=True))
-                found.tables["late"] = pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
+                result.tables["triage"] = rank_groups(pd.concat(some, ignore_index=True))
+                result.tables["late"] = pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
     if "units" in parts:
         try:
-            found.tables["units"] = compute_unit_worths(list(logs.values()), name, question.units).table
+            result.tables["units"] = compute_unit_worths(list(logs.values()), name, question.units).table
         except ExperimentError as error:
-            found.errors["units"] = error
-    return found
+            result.errors["units"] = error
+    return result
 
 
 # In words.
@@ -307,11 +307,11 @@ def _describe_causes(name: str, causes: pd.DataFrame, width: int | None) -> list
 
 def _explain_negative(causes: pd.DataFrame) -> Iterator[str]:
     """Sentences about shares below 0."""
-    of = causes.set_index("cause")
-    if "fusion" in of.index and of["added_s"]["fusion"] < -VISIBLE_S:
+    by_cause = causes.set_index("cause")
+    if "fusion" in by_cause.index and by_cause["added_s"]["fusion"] < -VISIBLE_S:
         yield "fusion below 0: entries of a neighbour within the gate are taken for an object that no list has yet"
-    worse = [name for name in of.index[of["gained_s"] < -VISIBLE_S] if name != "fusion"]
-    if worse and "queue" in of.index:
+    worse = [name for name in by_cause.index[by_cause["gained_s"] < -VISIBLE_S] if name != "fusion"]
+    if worse and "queue" in by_cause.index:
         yield f"gained_s below 0 ({', '.join(worse)}): without it lists are longer, and wait for the channel"
     elif worse:
         yield f"gained_s below 0 ({', '.join(worse)}): without it the fusion, or other draws, know objects later"

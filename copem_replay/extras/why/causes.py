@@ -73,7 +73,7 @@ def change_pems(experiment: Experiment, change: Callable[[Pem], Pem]) -> Experim
 
 
 def change_couples(change: Callable[[Couple], Couple]) -> Callable[[Pem], Pem]:
-    """A change of PEMs that changes all their couples."""
+    """A change of PEMs that applies `change` to all their couples."""
     return lambda pem: pem.model_copy(update={"couples": tuple(map(change, pem.couples))})
 
 
@@ -203,24 +203,26 @@ _OF_RECORDED = ("latency", "loss", "queue", "ticks", "fusion", "confirmation")
 
 
 def select_configuration(experiment: Experiment, name: str) -> Experiment:
-    """The experiment with one configuration, its units and nothing that a time of detection does not need.
+    """The experiment reduced to one configuration, its units and all that a time of detection depends on.
 
     Raises ExperimentError: there is none of this name, or it is the truth, a stack's recorded output, or its times may
     begin before the onset.
     """
     if name not in experiment.configurations:
         raise ExperimentError(unknown_name_message("configuration", name, experiment.configurations))
-    one = experiment.configurations[name]
-    if one.units == TRUTH or one.recorded is not None:
-        what = "is the truth, which is never late" if one.recorded is None else "is recorded: what made it is not known"
+    conf = experiment.configurations[name]
+    if conf.units == TRUTH or conf.recorded is not None:
+        what = (
+            "is the truth, which is never late" if conf.recorded is None else "is recorded: what made it is not known"
+        )
         raise ExperimentError(f"configuration {name}: {what}; choose one with units")
     if experiment.measure.count_earlier:
         raise ExperimentError(
             "measure.count_earlier: times may be negative then, which no cause explains; leave it out"
         )
-    own = experiment.units_of(one)
+    own = experiment.units_of(conf)
     units = {unit: experiment.units[unit] for unit in (*own, *experiment.list_sensing(own))}
-    links = [one.link_of(unit) for unit in own]
+    links = [conf.link_of(unit) for unit in own]
     measure = experiment.measure
     if measure.distance_to not in ("ego", *units):  # distances are from somewhere, though no time depends on it
         modelled = [unit for unit, its in units.items() if its.pem is not None]
@@ -228,16 +230,16 @@ def select_configuration(experiment: Experiment, name: str) -> Experiment:
             measure = measure.model_copy(update={"distance_to": modelled[0]})
         else:
             units[measure.distance_to] = experiment.units[measure.distance_to]
-    only = {
-        "configurations": {name: one}, "units": units, "measure": measure,
+    changes = {
+        "configurations": {name: conf}, "units": units, "measure": measure,
         "pems": _keep(experiment.pems, {unit.pem for unit in units.values()}),
         "links": _keep(experiment.links, {link for link in links if isinstance(link, str)}),
     }  # fmt: skip
-    return measure_times_only(experiment.model_copy(update=only))
+    return measure_times_only(experiment.model_copy(update=changes))
 
 
 def measure_times_only(experiment: Experiment) -> Experiment:
-    """The experiment with nothing that a time of detection does not need."""
+    """The experiment without all that no time of detection depends on."""
     nothing: dict[str, Any] = {"sweep": None, "show": None, "criteria": {}, "braking": None}
     measure = {"accuracy": False, "exact": False, "by": (), "metrics": (), "conflict": None}
     return experiment.model_copy(update=nothing | {"measure": experiment.measure.model_copy(update=measure)})
@@ -248,7 +250,7 @@ def _keep(named: Mapping[str, Any], names: Container[Any]) -> dict[str, Any]:
 
 
 def list_causes(experiment: Experiment) -> list[Cause]:
-    """The causes that act in an experiment of one configuration: without each of them it is another experiment.
+    """The causes that act in an experiment of one configuration: those whose removal changes it.
 
     Raises ExperimentError for a link of the user's own, whose latency and losses cannot be told apart, and for a
     visibility of the user's own, which may hide by more than bodies.
@@ -291,28 +293,28 @@ class Counterfactuals:
     """
 
     def __init__(
-        self, recording: Recording, experiment: Experiment, name: str, beside: Counterfactuals | None = None
+        self, recording: Recording, experiment: Experiment, name: str, before: Counterfactuals | None = None
     ) -> None:
         self._recording, self.only = recording, select_configuration(experiment, name)
-        self._whole: Replay = prepare_log(recording, experiment) if beside is None else beside._whole
-        self._found: dict[str, Float] = {} if beside is None else beside._found
-        self._ready: dict[str, Replay] = {} if beside is None else beside._ready
+        self._whole: Replay = prepare_log(recording, experiment) if before is None else before._whole
+        self._found: dict[str, Float] = {} if before is None else before._found
+        self._ready: dict[str, Replay] = {} if before is None else before._ready
 
     @cached_property
     def replay(self) -> Replay:
-        """The log as it is, made ready."""
+        """The unchanged log, prepared."""
         return self._find_ready(self.only)
 
     @cached_property
     def rows(self) -> pd.DataFrame:
-        """The rows that count, as they are: log, run, object, `unknown_s` and what else `detections.parquet` has."""
+        """The rows that count, unchanged: log, run, object, `unknown_s` and the columns of `detections.parquet`."""
         return replay_rows(self.replay, self.only)
 
     def unknown_s(self, gone: Sequence[Cause]) -> Float:
-        """(n,) seconds unknown of the rows that count without some causes; each replay is made once."""
-        experiment = reduce(lambda one, cause: cause.remove(one), gone, self.only)
-        (one,) = experiment.configurations.values()
-        key = experiment.model_copy(update={"configurations": {"": one}}).model_dump_json()
+        """(n,) seconds unknown of the rows that count, without some causes; each set of causes is replayed once."""
+        experiment = reduce(lambda changed, cause: cause.remove(changed), gone, self.only)
+        (configuration,) = experiment.configurations.values()
+        key = experiment.model_copy(update={"configurations": {"": configuration}}).model_dump_json()
         if key not in self._found:
             rows = self.rows if experiment == self.only else replay_rows(self._find_ready(experiment), experiment)
             same = rows[["run", "object_id", "onset_s"]].reset_index(drop=True)
@@ -321,15 +323,15 @@ class Counterfactuals:
             self._found[key] = rows["unknown_s"].to_numpy(dtype=float)
         return self._found[key]
 
-    def sight_s(self, gone: Sequence[Cause], after_s: Float) -> dict[str, Float]:
+    def sight_s(self, removed: Sequence[Cause], after_s: Float) -> dict[str, Float]:
         """By cause of `_SIGHT` seconds (n,) of the first `after_s` (n,) after the onset of each row that counts.
 
-        `gone`: all other causes, so that units list every frame of the truth.
+        `removed`: all other causes, so that units list every frame of the truth.
         """
-        experiment, rows = reduce(lambda one, cause: cause.remove(one), gone, self.only), self.rows
+        experiment, rows = reduce(lambda changed, cause: cause.remove(changed), removed, self.only), self.rows
         ready = self._find_ready(experiment)
         expanded, episodes = ready.expand(experiment), ready.episodes
-        (one,) = expanded.configurations.values()
+        (configuration,) = expanded.configurations.values()
         ids = [ready.scene.object_ids[k] for k in episodes.object_ix]
         places = {key: place for place, key in enumerate(zip(ids, episodes.number.tolist(), strict=True))}
         place = np.array([places[key] for key in zip(rows["object_id"], rows["episode"], strict=True)], dtype=np.int64)
@@ -337,9 +339,9 @@ class Counterfactuals:
         until_s = np.zeros((len(runs), len(ids)))
         until_s[run, place] = rows["onset_s"] + after_s
         equipped = expanded.equipped(ready.scene.log, runs)
-        there = np.ones((1, len(expanded.units)), dtype=bool) if equipped is None else equipped
+        present = np.ones((1, len(expanded.units)), dtype=bool) if equipped is None else equipped
         found = measure_sight(
-            ready.sight_spans, ready.sighted, expanded.list_sensing(expanded.units_of(one)), there, until_s
+            ready.sight_spans, ready.sighted, expanded.list_sensing(expanded.units_of(configuration)), present, until_s
         )
         seconds = {"range": found.out_of_view_s, "hidden": found.hidden_s}  # NaN: a unit does not say where it looks
         return {name: np.broadcast_to(np.nan_to_num(of), until_s.shape)[run, place] for name, of in seconds.items()}
@@ -355,18 +357,18 @@ class Counterfactuals:
         return ready
 
     def _prepare(self, experiment: Experiment) -> Replay:
-        """The log made ready for an experiment without some causes; of what stays the same nothing is made anew."""
-        clear = experiment.visibility != self.only.visibility
+        """The log prepared for an experiment without some causes; parts that these do not change are reused."""
+        unblocked = experiment.visibility != self.only.visibility
         if experiment.units != self.only.units or experiment == self.only:
-            as_it_is = experiment.model_copy(update={"visibility": self.only.visibility})
-            base = prepare_log(self._recording, as_it_is)
+            blocked = experiment.model_copy(update={"visibility": self.only.visibility})
+            base = prepare_log(self._recording, blocked)
             base = replace(base, episodes=self._whole.episodes, outside_ix=self._whole.outside_ix)
         else:
             base = self.replay
-            if experiment.pems == self.only.pems and not clear:
+            if experiment.pems == self.only.pems and not unblocked:
                 return base
         return replace(
-            base, expanded=expand_experiment(experiment, base.scene), paths_of=base if clear else base.paths_of
+            base, expanded=expand_experiment(experiment, base.scene), paths_of=base if unblocked else base.paths_of
         )
 
 
@@ -382,7 +384,7 @@ class CauseShares:
 def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
     """What each acting cause adds to the time unknown of every row; the rows of `added_s` sum to it."""
     causes, recorded = list_causes(replays.only), bool(replays.only.recorded)
-    chain, whole = [cause for cause in causes if cause.name not in _SIGHT], replays.unknown_s(())
+    chain, as_is = [cause for cause in causes if cause.name not in _SIGHT], replays.unknown_s(())
 
     known = replays.unknown_s(chain)
     sight = replays.sight_s(chain, known)
@@ -393,7 +395,7 @@ def share_lateness(replays: Counterfactuals) -> list[CauseShares]:
         added[cause.name] = later - known - sum(then[name] - sight[name] for name in _SIGHT)
         known, sight = later, then
     added |= {name: of for name, of in sight.items() if of.any() or any(cause.name == name for cause in causes)}
-    gained = {cause.name: whole - replays.unknown_s([cause]) for cause in causes}
+    gained = {cause.name: as_is - replays.unknown_s([cause]) for cause in causes}
     return [CauseShares(one, added[one.name], gained.get(one.name)) for one in _ORDER if one.name in added]
 
 
@@ -407,14 +409,14 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
     order = [cause.name for cause in _ORDER]
     table = []
     for name in sorted(names, key=order.index):
-        found = [_find(shares, name) for _, shares in of_logs]
+        shares_of_logs = [_find(shares, name) for _, shares in of_logs]
         counts = [len(replays.rows) for replays, _ in of_logs]
         added = np.concatenate(
-            [np.zeros(n) if one is None else one.added_s for one, n in zip(found, counts, strict=True)]
+            [np.zeros(n) if one is None else one.added_s for one, n in zip(shares_of_logs, counts, strict=True)]
         )
-        gains = [np.zeros(n) if one is None else one.gained_s for one, n in zip(found, counts, strict=True)]
+        gains = [np.zeros(n) if one is None else one.gained_s for one, n in zip(shares_of_logs, counts, strict=True)]
         known = [gain for gain in gains if gain is not None]
-        cause = next(one.cause for one in found if one is not None)
+        cause = next(one.cause for one in shares_of_logs if one is not None)
         by_run = pd.Series(added).groupby(rows["run"].to_numpy()).mean()
         table.append({
             "cause": name, "group": cause.group,
@@ -427,7 +429,7 @@ def tabulate_causes(of_logs: Sequence[tuple[Counterfactuals, list[CauseShares]]]
 
 
 def name_cause(share: CauseShares) -> str:
-    """The name of what a share is of."""
+    """The name of the cause of a share."""
     return share.cause.name
 
 

@@ -52,28 +52,28 @@ def why(
     folder = out or Path("out") / f"{experiment.stem}_why"
     if experiment.is_dir():
         folder = out or experiment / "why"
-    asked = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
-    if asked and unit is not None and "units" not in asked:
-        asked.append("units")
-    found = show_progress(
+    chosen_parts = [part for part, on in zip(PARTS, (causes, units, triage, sensitivity), strict=True) if on]
+    if chosen_parts and unit is not None and "units" not in chosen_parts:
+        chosen_parts.append("units")
+    answer = show_progress(
         "explaining",
         lambda progress: compute(
             experiment,
             configurations=configuration,
-            parts=asked or None,
+            parts=chosen_parts or None,
             units=split_names(unit),
             progress=progress,
         ),
     )
-    whole = explain or bool(asked)
-    print_notes(found.notes if whole or configuration else [note for note in found.notes if ": of " in note])
-    written = found.save(folder)
-    place, of_one = str(experiment) if experiment.is_dir() else "FOLDER", False
+    full = explain or bool(chosen_parts)
+    print_notes(answer.notes if full or configuration else [note for note in answer.notes if ": of " in note])
+    paths = answer.save(folder)
+    place, one_log = str(experiment) if experiment.is_dir() else "FOLDER", False
     if experiment.is_dir():
-        of_one = len(open_results(experiment).provenance.logs) == 1
-    if whole:
-        print_blocks(list(found.blocks(width_of(sys.stdout))))
+        one_log = len(open_results(experiment).provenance.logs) == 1
+    if full:
+        print_blocks(list(answer.blocks(width_of(sys.stdout))))
     else:
-        print_rows(tell_explanation(found, place, of_one=of_one))
-    print_line(f"{', '.join(path.name for path in written)} in {folder}{'' if whole else '; every figure: --explain'}")
+        print_rows(tell_explanation(answer, place, one_log=one_log))
+    print_line(f"{', '.join(path.name for path in paths)} in {folder}{'' if full else '; every figure: --explain'}")
     return 0

@@ -111,9 +111,9 @@ def _two_decimals(seconds: float) -> str:
     return "" if math.isnan(seconds) else format_two_decimals(seconds)
 
 
-def _unit_table(name: str, of: pd.DataFrame) -> Html:
+def _unit_table(name: str, units: pd.DataFrame) -> Html:
     rows = []
-    for row in of.to_dict("records"):
+    for row in units.to_dict("records"):
         cells = [make_tag("td", format_two_decimals(float(row[key]))) for key in ("share_s", "alone_s", "left_out_s")]
         rows.append(make_tag("tr", make_tag("th", allow_breaks(str(row["unit"])), scope="row"), *cells))
     return make_table(["unit", "its share (Shapley), s", "alone, s", "if left out, s"], rows, caption=name)
@@ -128,10 +128,10 @@ def _variation_table(means: pd.DataFrame) -> Html:
     return make_table(list(map(str, means.columns)), rows, caption="Seconds that objects are unknown, in the mean")
 
 
-def _group_list(name: str, of: pd.DataFrame) -> Html:
-    lost_s = float(of["lost_s"].sum())
+def _group_list(name: str, groups: pd.DataFrame) -> Html:
+    lost_s = float(groups["lost_s"].sum())
     lines = []
-    for row in of.head(_MOST_GROUPS).to_dict("records"):
+    for row in groups.head(_MOST_GROUPS).to_dict("records"):
         where = f" ({row['where']})" if row["where"] else ""
         objects, share = count_noun(int(row["objects"]), "object"), format_per_cent(float(row["lost_s"]) / lost_s)
         words = (
@@ -142,7 +142,7 @@ def _group_list(name: str, of: pd.DataFrame) -> Html:
         view = make_tag("code", f"copem-replay view FOLDER --object {row['example']} --log {row['log']}")
         such = ["such as ", story, " ", view] if row["example"] else [TOO_SHORT]
         lines.append(make_tag("span", f"{words}; ", *such))
-    rest = len(of) - _MOST_GROUPS
+    rest = len(groups) - _MOST_GROUPS
     more = [f"and {count_noun(rest, 'group')} more in {FOLDER}/triage.csv"] if rest > 0 else []
     head = make_tag("p", f"{name}: late for more than 1 s, {lost_s:.1f} s in all")
     return make_tag("div", head, make_list([*lines, *more]))

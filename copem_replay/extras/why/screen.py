@@ -20,14 +20,14 @@ _HEADERS = {"range": "out of view", "hidden": "hidden", "missed": "missed in sig
 """Causes whose words are too long for a header; of others the part before a colon."""
 
 
-def tell_explanation(explained: Explanation, folder: str, *, of_one: bool) -> Iterator[str]:
-    """Lines. `folder`: of the results that `view` opens; `of_one`: they are of one log."""
+def tell_explanation(explained: Explanation, folder: str, *, one_log: bool) -> Iterator[str]:
+    """Lines. `folder`: of the results that `view` opens; `one_log`: they are of one log."""
     if explained.causes is not None:
         yield from [*_tabulate_seconds(explained.causes), ""]
     if explained.units is not None:
         yield from _tell_units(explained.units)
     if explained.triage is not None and explained.causes is not None:
-        yield from _tell_late(explained.triage, folder, of_one=of_one)
+        yield from _tell_late(explained.triage, folder, one_log=one_log)
     if explained.sensitivity is not None and explained.orders is not None:
         yield from _tell_orders(explained.sensitivity, explained.orders)
 
@@ -50,34 +50,34 @@ def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
 def _tell_units(units: pd.DataFrame) -> list[str]:
     """What units spare beside those that are given, the most first; what is alike stands together."""
     most = units.groupby("unit")["share_s"].max().sort_values(ascending=False, kind="stable")
-    alike: dict[str, list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for unit in most.index:
         by_words: dict[str, list[str]] = {}
         for row in units[units["unit"] == unit].itertuples(index=False):
             saved = f"{row.share_s:.2f} s" if abs(row.share_s) >= VISIBLE_S else "nothing"
             by_words.setdefault(saved, []).append(str(row.configuration))
         told = ", ".join(f"{words} in {name_first(of, _NAMED)}" for words, of in by_words.items())
-        alike.setdefault(told, []).append(str(unit))
-    shown = [f"{name_first(of, _NAMED)} save{'s' * (len(of) == 1)} {told}." for told, of in alike.items()]
-    return [*shown[:_MOST_SPARED], *(["The other units are in units.csv."] if len(alike) > _MOST_SPARED else [])]
+        groups.setdefault(told, []).append(str(unit))
+    shown = [f"{name_first(of, _NAMED)} save{'s' * (len(of) == 1)} {told}." for told, of in groups.items()]
+    return [*shown[:_MOST_SPARED], *(["The other units are in units.csv."] if len(groups) > _MOST_SPARED else [])]
 
 
-def _tell_late(groups: pd.DataFrame, folder: str, *, of_one: bool) -> list[str]:
+def _tell_late(groups: pd.DataFrame, folder: str, *, one_log: bool) -> list[str]:
     """The group of late episodes that costs most, and how to look at one."""
     if not len(groups):
         return [f"No object is unknown for more than {LATE_S:g} s in 5 % of the runs or more."]
     worst = groups.loc[groups["lost_s"].idxmax()]
     where = f" ({worst['where']})" if worst["where"] else ""
     named, count = f"{worst['example_class']} {worst['example']}", int(worst["objects"])
-    told = f"{count_noun(count, 'object')} such as {named}" if count > 1 else named
-    told = told if worst["example"] else f"{count_noun(count, 'object')}, {TOO_SHORT}"
+    objects = f"{count_noun(count, 'object')} such as {named}" if count > 1 else named
+    objects = objects if worst["example"] else f"{count_noun(count, 'object')}, {TOO_SHORT}"
     shown = groups[groups["example"] != ""].sort_values("lost_s", ascending=False, kind="stable").head(1)
     how = describe_structure(float(worst["structural_share"]))
     return [
-        f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {told}: "
+        f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {objects}: "
         f"{describe_cause(str(worst['cause']))}{where}{how}.",
         *(
-            f"    copem-replay view {folder} --object {row.example}" + ("" if of_one else f" --log {row.log}")
+            f"    copem-replay view {folder} --object {row.example}" + ("" if one_log else f" --log {row.log}")
             for row in shown.itertuples()
         ),
     ]

@@ -120,28 +120,28 @@ def vary_pems(
     `names`: only these configurations; None: all. `known`: by configuration the rows of all logs as they are, which are
     not replayed again. Raises ExperimentError where no configuration has modelled units alone.
     """
-    modelled, found = [(recording, _select_modelled(e, names)) for recording, e in logs], []
-    asked, known = modelled[0][1].configurations, known or {}
+    modelled, tables = [(recording, _select_modelled(e, names)) for recording, e in logs], []
+    configurations, known = modelled[0][1].configurations, known or {}
     for variation, vary in VARIATIONS.items():
         if variation != AS_IT_IS and all(vary(e) == e for _, e in modelled):
             continue
-        if variation == AS_IT_IS and known.keys() >= asked.keys():
-            rows = pd.concat([known[name] for name in asked], ignore_index=True)
+        if variation == AS_IT_IS and known.keys() >= configurations.keys():
+            rows = pd.concat([known[name] for name in configurations], ignore_index=True)
         else:
             rows = pd.concat([_replay(recording, vary(e)) for recording, e in modelled], ignore_index=True)
         means = rows.groupby(["configuration", "run"], sort=False)["unknown_s"].mean().reset_index()
-        found.append(means.assign(variation=variation))
-    return pd.concat(found, ignore_index=True)
+        tables.append(means.assign(variation=variation))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _select_modelled(experiment: Experiment, names: Sequence[str] | None) -> Experiment:
     configurations = {
-        name: one
-        for name, one in experiment.configurations.items()
-        if one.recorded is None
-        and one.units != TRUTH
+        name: configuration
+        for name, configuration in experiment.configurations.items()
+        if configuration.recorded is None
+        and configuration.units != TRUTH
         and (names is None or name in names)
-        and not set(experiment.units_of(one)) & set(experiment.recorded)
+        and not set(experiment.units_of(configuration)) & set(experiment.recorded)
     }
     if not configurations:
         raise ExperimentError("sensitivity: expected a configuration with modelled units alone, found none")
@@ -153,7 +153,7 @@ def _replay(recording: Recording, experiment: Experiment) -> pd.DataFrame:
 
 
 def compare_orders(varied: pd.DataFrame) -> pd.DataFrame:
-    """Of each variation the pairs of configurations whose order is another, with both differences and their errors.
+    """By variation the pairs of configurations whose order changes, with both differences and their errors.
 
     Rows: variation, better, worse (as it is), `difference_s`, `error_s` as it is, `varied_s`, `varied_error_s`, and
     `beyond`: both beyond two standard errors over the runs. A difference without an error (one run) is never beyond.
@@ -188,7 +188,7 @@ def tabulate_variations(varied: pd.DataFrame) -> pd.DataFrame:
 
 
 def describe_orders(varied: pd.DataFrame, orders: pd.DataFrame) -> list[str]:
-    """A sentence for each variation: how many pairs keep their order, and which do not; none without a pair."""
+    """One sentence per variation: how many pairs keep their order, and which do not; none without a pair."""
     count = varied["configuration"].nunique()
     if count < 2:
         return []

@@ -40,18 +40,18 @@ def tabulate_episodes(replays: Counterfactuals, shares: Sequence[CauseShares], l
     known in time even if every list of every unit held it. `cause`: the one that adds most. What recorded units missed
     is not known: structural is NaN, and nothing is hopeless.
     """
-    rows, gone = replays.rows, [one.cause for one in shares if one.gained_s is not None]
+    rows, gone = replays.rows, [share.cause for share in shares if share.gained_s is not None]
     unknown_s, length_s = rows["unknown_s"].to_numpy(), (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     unmissed_s = replays.unknown_s([cause for cause in gone if cause.name in ("missed", "memory")])
     at_best_s = replays.unknown_s([cause for cause in gone if cause.name in _HELPED])
     structural, hopeless = (unmissed_s > late_s).astype(float), at_best_s >= length_s - SAME_INSTANT_S
     if replays.only.recorded:
         structural, hopeless = np.full(len(rows), np.nan), np.zeros(len(rows), dtype=bool)
-    names = [name_cause(one) for one in shares]
+    names = [name_cause(share) for share in shares]
     values = pd.DataFrame({
         "unknown_s": unknown_s, "late_share": unknown_s > late_s, "structural_share": structural,
         "never_share": rows["detection_s"].isna().to_numpy(), "hopeless_share": hopeless,
-        **{f"added {name}": one.added_s for name, one in zip(names, shares, strict=True)},
+        **{f"added {name}": share.added_s for name, share in zip(names, shares, strict=True)},
     }).astype(float)  # fmt: skip
     keys = [*EPISODE, "object_class", "onset_s", "ended_s"]
     values[keys] = rows[keys].reset_index(drop=True)
@@ -71,13 +71,13 @@ def group_late_episodes(
     if is_late.any():
         episodes.loc[is_late, ["where", "hidden_by"]] = find_places(replays.replay, episodes[is_late])
     grouped, none_is = [], not is_observed(episodes).any()  # then some are shown all the same
-    for (log, cause), of in episodes[is_late].groupby(["log", "cause"], sort=False):
-        judged = of[is_observed(of) | none_is]
-        worst = of.loc[(judged if len(judged) else of)["unknown_s"].idxmax()]
+    for (log, cause), rows in episodes[is_late].groupby(["log", "cause"], sort=False):
+        judged = rows[is_observed(rows) | none_is]
+        worst = rows.loc[(judged if len(judged) else rows)["unknown_s"].idxmax()]
         grouped.append({
-            "log": log, "cause": cause, "where": name_places(of), "episodes": len(of),
-            "objects": of["object_id"].nunique(), "lost_s": of["unknown_s"].sum(),
-            "never_share": of["never_share"].mean(), "structural_share": _share_structural(of["structural_share"]),
+            "log": log, "cause": cause, "where": name_places(rows), "episodes": len(rows),
+            "objects": rows["object_id"].nunique(), "lost_s": rows["unknown_s"].sum(),
+            "never_share": rows["never_share"].mean(), "structural_share": _share_structural(rows["structural_share"]),
             "example": worst["object_id"] if len(judged) else "",
             "example_class": worst["object_class"], "example_onset_s": worst["onset_s"],
         })  # fmt: skip
@@ -118,9 +118,9 @@ def rank_groups(groups: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_places(replay: Replay, episodes: pd.DataFrame) -> list[tuple[str, str]]:
-    """Of each row where it is, and the body that hides it most often while it is unknown; empty: none does.
+    """By row the place, and the body that hides the object most often while it is unknown; empty: none does.
 
-    Where: this body if being hidden is the cause, else the side of the ego.
+    The place is this body if being hidden is the cause, else the side of the ego.
     """
     ids = {name: number for number, name in enumerate(replay.scene.object_ids)}
     objects: Int = np.array([ids[name] for name in episodes["object_id"]], dtype=np.int64)
@@ -155,11 +155,11 @@ def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:
     for number, begin_s in zip(objects.tolist(), at_s.tolist(), strict=True):
         frame = int(np.searchsorted(truth.captured_s, begin_s - SAME_INSTANT_S))
         rows = np.flatnonzero(truth.frame_ix == frame)
-        there, of_ego = rows[truth.row_object_ix[rows] == number], rows[truth.row_object_ix[rows] == ego]
-        if not len(there) or not len(of_ego):
+        object_rows, of_ego = rows[truth.row_object_ix[rows] == number], rows[truth.row_object_ix[rows] == ego]
+        if not len(object_rows) or not len(of_ego):
             sides.append("")
             continue
-        dx, dy = (float(column[0, there[0]] - column[0, of_ego[0]]) for column in (truth.x_m, truth.y_m))
+        dx, dy = (float(column[0, object_rows[0]] - column[0, of_ego[0]]) for column in (truth.x_m, truth.y_m))
         turn = np.arctan2(dy, dx) - truth.yaw_rad[0, of_ego[0]]
         sides.append(("ahead", "left", "behind", "right")[int(np.round(turn / (np.pi / 2))) % 4])
     return sides

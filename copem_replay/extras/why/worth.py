@@ -60,7 +60,7 @@ class UnitWorths:
 
     @property
     def table(self) -> pd.DataFrame:
-        """The rows of `units.csv`."""
+        """The worths as rows of `units.csv`."""
         columns = {"share_s": self.share_s, "alone_s": self.alone_s, "left_out_s": self.left_out_s}
         table = pd.DataFrame({"unit": self.units, **columns})
         return table.sort_values(  # units that are alike stay in their order, whatever rounding does
@@ -77,33 +77,33 @@ def compute_unit_worths(
     ExperimentError for a unit that the configuration has not, and for more than `MOST_UNITS` where times have no closed
     form.
     """
-    only = [(recording, select_configuration(experiment, name)) for recording, experiment in logs]
-    first = only[0][1]
+    selected = [(recording, select_configuration(experiment, name)) for recording, experiment in logs]
+    first = selected[0][1]
     members = first.units_of(first.configurations[name])
     for unit in units or ():
         if unit not in members:
             raise ExperimentError(f"configuration {name}: {unknown_name_message('unit', unit, members)}")
-    asked = tuple(units or (unit for unit in members if first.units[unit].on != "ego"))
-    if not asked:
+    judged = tuple(units or (unit for unit in members if first.units[unit].on != "ego"))
+    if not judged:
         raise ExperimentError(
             f"configuration {name}: expected a unit beside the ego's, found {', '.join(members)} alone"
         )
-    given = tuple(unit for unit in members if unit not in asked)
-    if all(_is_product(experiment, name) for _, experiment in only):
+    others = tuple(unit for unit in members if unit not in judged)
+    if all(_is_product(experiment, name) for _, experiment in selected):
         try:
-            curves = [one for log in only for one in _list_curves(*log, name, asked, given)]
+            curves = [one for log in selected for one in _list_curves(*log, name, judged, others)]
         except ExperimentError as error:
-            _check_count(name, asked, str(error))
+            _check_count(name, judged, str(error))
         else:
-            return share_by_curves(asked, curves)
-    _check_count(name, asked, "its units are not independent, or its fusion is not ideal")
-    return share_by_sets(asked, _replay_sets(only, name, asked, given))
+            return share_by_curves(judged, curves)
+    _check_count(name, judged, "its units are not independent, or its fusion is not ideal")
+    return share_by_sets(judged, _replay_sets(selected, name, judged, others))
 
 
-def _check_count(name: str, asked: Sequence[str], why: str) -> None:
-    if len(asked) > MOST_UNITS:
+def _check_count(name: str, judged: Sequence[str], why: str) -> None:
+    if len(judged) > MOST_UNITS:
         raise ExperimentError(
-            f"configuration {name}: {len(asked)} units have {2 ** len(asked) - 1:,} sets to replay ({why}); "
+            f"configuration {name}: {len(judged)} units have {2 ** len(judged) - 1:,} sets to replay ({why}); "
             f"ask about {MOST_UNITS} at most with --unit, or use ideal fusion"
         )
 
@@ -126,26 +126,26 @@ def _is_product(experiment: Experiment, name: str) -> bool:
 
 
 def _list_curves(
-    recording: Recording, experiment: Experiment, name: str, asked: Sequence[str], given: Sequence[str]
+    recording: Recording, experiment: Experiment, name: str, judged: Sequence[str], others: Sequence[str]
 ) -> Iterator[UnitCurves]:
     """The curves of each episode that counts; what is given is part of the lengths of spans."""
-    one, alone = experiment.configurations[name], {}
-    for unit in (*asked, *given):
-        alone[unit] = one.model_copy(update={"units": (unit,)})
-    singles = experiment.model_copy(update={"configurations": alone})
+    one, configurations = experiment.configurations[name], {}
+    for unit in (*judged, *others):
+        configurations[unit] = one.model_copy(update={"units": (unit,)})
+    singles = experiment.model_copy(update={"configurations": configurations})
     replay = prepare_log(recording, singles)
     table = select_counted(exact_table(replay, singles), experiment.measure.began)
     for _, rows in table.groupby(["object_id", "episode"], sort=False):
         onset_s, ended_s = float(rows["onset_s"].iloc[0]), float(rows["ended_s"].iloc[0])
         known = rows.dropna(subset="detection_s")
         at_s = np.unique(np.clip([onset_s, *known["detection_s"], ended_s], onset_s, ended_s))
-        unknown = np.ones((len(alone), max(len(at_s) - 1, 0)))
-        for k, unit in enumerate(alone):
+        unknown = np.ones((len(configurations), max(len(at_s) - 1, 0)))
+        for k, unit in enumerate(configurations):
             curve = known[known["configuration"] == unit].sort_values("detection_s")
             last = np.searchsorted(np.maximum(curve["detection_s"].to_numpy(), onset_s), at_s[:-1], side="right") - 1
             incidence = np.append(curve["incidence"].to_numpy(), 0.0)  # −1: none yet
             unknown[k] = 1 - incidence[last]
-        yield UnitCurves(np.diff(at_s) * unknown[len(asked) :].prod(axis=0), unknown[: len(asked)])
+        yield UnitCurves(np.diff(at_s) * unknown[len(judged) :].prod(axis=0), unknown[: len(judged)])
 
 
 def share_by_curves(units: Sequence[str], curves: Sequence[UnitCurves]) -> UnitWorths:
@@ -178,15 +178,15 @@ def share_by_curves(units: Sequence[str], curves: Sequence[UnitCurves]) -> UnitW
 
 
 def _replay_sets(
-    logs: Sequence[tuple[Recording, Experiment]], name: str, asked: Sequence[str], given: Sequence[str]
+    logs: Sequence[tuple[Recording, Experiment]], name: str, judged: Sequence[str], others: Sequence[str]
 ) -> dict[frozenset[str], float]:
     """The mean time unknown of each set of the units asked about, beside those that are given."""
-    sets = [frozenset(some) for size in range(len(asked) + 1) for some in combinations(asked, size)]
+    sets = [frozenset(unit_set) for size in range(len(judged) + 1) for unit_set in combinations(judged, size)]
     total_s, count = dict.fromkeys(sets, 0.0), dict.fromkeys(sets, 0)
     for recording, experiment in logs:
         configurations = {}
-        for number, some in enumerate(sets):
-            units = tuple(unit for unit in experiment.units if unit in some or unit in given)
+        for number, unit_set in enumerate(sets):
+            units = tuple(unit for unit in experiment.units if unit in unit_set or unit in others)
             if units:
                 configurations[str(number)] = experiment.configurations[name].model_copy(update={"units": units})
         several = experiment.model_copy(update={"configurations": configurations})
@@ -194,16 +194,16 @@ def _replay_sets(
         for number, of_set in rows.groupby("configuration", sort=False):
             total_s[sets[int(str(number))]] += of_set["unknown_s"].sum()
             count[sets[int(str(number))]] += len(of_set)
-        if not given:  # nothing is ever known without a unit
+        if not others:  # nothing is ever known without a unit
             of_one = rows[rows["configuration"] == "1"]
             total_s[frozenset()] += (of_one["ended_s"] - of_one["onset_s"]).sum()
             count[frozenset()] += len(of_one)
-    return {some: total_s[some] / count[some] for some in sets}
+    return {unit_set: total_s[unit_set] / count[unit_set] for unit_set in sets}
 
 
 def share_by_sets(units: Sequence[str], unknown_s: Mapping[frozenset[str], float]) -> UnitWorths:
     """Worths from the time unknown with each set of units."""
-    n, whole, nobody = len(units), frozenset(units), frozenset[str]()
+    n, full, nobody = len(units), frozenset(units), frozenset[str]()
     share_s = np.zeros(n)
     for k, unit in enumerate(units):
         for some in unknown_s:
@@ -211,5 +211,5 @@ def share_by_sets(units: Sequence[str], unknown_s: Mapping[frozenset[str], float
                 weight = math.factorial(len(some)) * math.factorial(n - len(some) - 1) / math.factorial(n)
                 share_s[k] += weight * (unknown_s[some] - unknown_s[some | {unit}])
     alone_s = np.array([unknown_s[nobody] - unknown_s[frozenset({unit})] for unit in units])
-    left_out_s = np.array([unknown_s[whole - {unit}] - unknown_s[whole] for unit in units])
-    return UnitWorths(tuple(units), share_s, alone_s, left_out_s, unknown_s[nobody], unknown_s[whole], by_curves=False)
+    left_out_s = np.array([unknown_s[full - {unit}] - unknown_s[full] for unit in units])
+    return UnitWorths(tuple(units), share_s, alone_s, left_out_s, unknown_s[nobody], unknown_s[full], by_curves=False)

@@ -99,7 +99,7 @@ class ChunkAllowance:
         self._too_large = 0
 
     def refuse(self) -> ValueError:
-        """The error for a chunk that is too large; it is counted, since work was done for it in vain."""
+        """The error for a chunk that is too large; it is counted, as it cost work in vain."""
         self._too_large += 1
         return ValueError(f"a chunk holds more than {CHUNK_LIMIT_BYTES >> 20} MiB")
 
@@ -305,12 +305,12 @@ def _parse_summary(section: bytes) -> Summary:
 
 def read_metadata(file: IO[bytes], summary: Summary, name: str) -> dict[str, str]:
     """The metadata records of a name, later ones over earlier ones; empty without any. Raises DAMAGE."""
-    found: dict[str, str] = {}
+    entries: dict[str, str] = {}
     for index in summary.metadata_indexes:
         if index.name == name:
             record = parse_record(Opcode.METADATA, read_record_at(file, index.offset, Opcode.METADATA))
-            found |= record.metadata if isinstance(record, Metadata) else {}
-    return found
+            entries |= record.metadata if isinstance(record, Metadata) else {}
+    return entries
 
 
 def read_by_log_time(file: IO[bytes], summary: Summary, spans: Mapping[int, Span]) -> Iterator[Message]:
@@ -325,11 +325,11 @@ def read_by_log_time(file: IO[bytes], summary: Summary, spans: Mapping[int, Span
         (c.message_start_time, offset, -1, None) for offset, c in chunks.items()
     ]
     heapq.heapify(waiting)
-    allowance, held = ChunkAllowance(file), 0
+    allowance, held_bytes = ChunkAllowance(file), 0
     while waiting:
         _, offset, place, message = heapq.heappop(waiting)
         if message is not None:
-            held -= len(message.data)
+            held_bytes -= len(message.data)
             yield message
             continue
         for place, record in enumerate(read_chunk(read_record_at(file, offset, Opcode.CHUNK), allowance)):
@@ -338,8 +338,8 @@ def read_by_log_time(file: IO[bytes], summary: Summary, spans: Mapping[int, Span
             if record.channel_id not in summary.channels:
                 raise ValueError("the index lacks a channel")
             if is_kept(spans, record.channel_id, record.log_time):
-                held += len(record.data)
-                if held > _HELD_LIMIT_BYTES:
+                held_bytes += len(record.data)
+                if held_bytes > _HELD_LIMIT_BYTES:
                     raise ValueError("its chunks overlap in time")
                 heapq.heappush(waiting, (record.log_time, offset, place, record))
 

@@ -199,7 +199,7 @@ def _find_schema(path: Path, named: str) -> tuple[str, list[str]]:
 
 def _explained_share(payloads: Sequence[bytes], schema: str) -> float:
     """Share of the bytes of messages that have a meaning in a schema, from 0 to 1."""
-    kept = 0
+    explained_bytes = 0
     for payload in payloads:
         try:
             check_osi(message_class := load_message_class(schema), payload)
@@ -207,5 +207,5 @@ def _explained_share(payloads: Sequence[bytes], schema: str) -> float:
         except (DecodeError, OversizeError):
             continue
         message.DiscardUnknownFields()
-        kept += min(len(payload), message.ByteSize())
-    return kept / max(sum(map(len, payloads)), 1)
+        explained_bytes += min(len(payload), message.ByteSize())
+    return explained_bytes / max(sum(map(len, payloads)), 1)

@@ -181,15 +181,15 @@ class BagLog(Log):
 
     def from_start(self, error: BrokenIndexError) -> Log:
         """The log with every file opened without its index. Raises RecordingError."""
-        logs, lost = [], list(self.lost)
+        logs, unread = [], list(self.lost)
         for part in self.parts:
             log = part.log
             try:
                 cause = error.__cause__ if log.path == error.path else None
                 logs.append(open_from_start(log.path, cause, log.channels) if log.indexed else log)
             except RecordingError as failure:
-                lost.append(_error_in_file(log.path, failure))
-        return _join_bag_files(self.path, logs, lost, self.notes).within(self.window)
+                unread.append(_error_in_file(log.path, failure))
+        return _join_bag_files(self.path, logs, unread, self.notes).within(self.window)
 
 
 def _read_renumbered(log: Log, numbers: Mapping[int, int], sort: bool) -> Iterator[Message]:
@@ -198,20 +198,20 @@ def _read_renumbered(log: Log, numbers: Mapping[int, int], sort: bool) -> Iterat
 
 def open_bag(folder: Path) -> BagLog:
     """The log of a rosbag2 folder. Raises RecordingError: none of rosbag2, a file is missing or not read."""
-    logs, lost = [], []
+    logs, unread = [], []
     paths = list_bag_files(folder)
     for path in paths:
         try:
             logs.append(open_sqlite(path) if path.suffix == DB3 else open_mcap(path))
         except RecordingError as error:
-            lost.append(_error_in_file(path, error))
-    return _join_bag_files(folder, logs, lost, tuple(note_unnamed_files(folder, paths)))
+            unread.append(_error_in_file(path, error))
+    return _join_bag_files(folder, logs, unread, tuple(note_unnamed_files(folder, paths)))
 
 
-def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], notes: tuple[str, ...]) -> BagLog:
+def _join_bag_files(folder: Path, logs: Sequence[Log], unread: Sequence[str], notes: tuple[str, ...]) -> BagLog:
     if not logs:
-        first, *others = lost
-        more = f"; and so on, {count_noun(len(lost), 'file')} in all" if others else ""
+        first, *others = unread
+        more = f"; and so on, {count_noun(len(unread), 'file')} in all" if others else ""
         raise RecordingError(f"{first}{more}", path=folder)
     damages = [f"{log.path.name}: {log.damage}" for log in logs if log.damage]
     numbers: dict[tuple[object, ...], int] = {}
@@ -230,23 +230,23 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], lost: Sequence[str], note
         path=folder,
         channels=tuple(channels[number] for number in sorted(channels)),
         indexed=all(log.indexed for log in logs),
-        damage="; ".join([*damages, *lost]) or None,
-        complete=not lost and all(log.complete for log in logs),
-        went_on=bool(lost) or any(log.went_on or log.start_ns < last for log in logs if not log.complete),
+        damage="; ".join([*damages, *unread]) or None,
+        complete=not unread and all(log.complete for log in logs),
+        went_on=bool(unread) or any(log.went_on or log.start_ns < last for log in logs if not log.complete),
         start_ns=min(log.start_ns for log in logs),
         end_ns=max(log.end_ns for log in logs),
         notes=tuple(dict.fromkeys([*notes, *of_files])),
         parts=tuple(parts),
         tags={name: value for log in reversed(logs) for name, value in log.tags.items()},
-        lost=tuple(lost),
+        lost=tuple(unread),
     )
 
 
-def _merge_channels(one: Channel, other: Channel) -> Channel:
+def _merge_channels(first: Channel, second: Channel) -> Channel:
     """One channel for two files: the messages of both, counted."""
-    expected = [c.messages if c.expected is None else c.expected for c in (one, other)]
-    has_expected = one.expected is not None or other.expected is not None
-    return replace(one, messages=one.messages + other.messages, expected=sum(expected) if has_expected else None)
+    expected = [c.messages if c.expected is None else c.expected for c in (first, second)]
+    has_expected = first.expected is not None or second.expected is not None
+    return replace(first, messages=first.messages + second.messages, expected=sum(expected) if has_expected else None)
 
 
 def _error_in_file(path: Path, error: RecordingError) -> str:

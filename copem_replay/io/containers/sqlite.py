@@ -49,11 +49,11 @@ def open_sqlite(path: Path) -> SqliteLog:
         span, connections = reader.metadata, reader.connections
         channels = [
             Channel(
-                number=of.id, topic=of.topic, schema=of.msgtype, encoding=getattr(of.ext, "serialization_format", ""),
-                messages=of.msgcount, schema_encoding=_FORMATS[of.msgdef.format.name],
-                schema_data=of.msgdef.data.encode(),
+                number=c.id, topic=c.topic, schema=c.msgtype, encoding=getattr(c.ext, "serialization_format", ""),
+                messages=c.msgcount, schema_encoding=_FORMATS[c.msgdef.format.name],
+                schema_data=c.msgdef.data.encode(),
             )
-            for of in connections
+            for c in connections
         ]  # fmt: skip
     ahead = Path(f"{path}-wal")
     lost = ahead.is_file() and ahead.stat().st_size > 0

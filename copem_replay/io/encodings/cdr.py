@@ -64,8 +64,8 @@ def walk_cdr(
     """As `Walk`, of values that are all there. A message that does not fit its schema leaves no rows."""
     rows = np.zeros(len(room), dtype=np.int64)
     before = np.zeros(len(room), dtype=np.int64)
-    back = np.zeros(DEEPEST, dtype=np.int64)  # instruction after the head of each list that is open
-    left = np.zeros(DEEPEST, dtype=np.int64)  # its items still to come
+    loop_start = np.zeros(DEEPEST, dtype=np.int64)  # instruction after the head of each list that is open
+    items_left = np.zeros(DEEPEST, dtype=np.int64)  # its items still to come
     owner = np.zeros(DEEPEST, dtype=np.int64)  # its level
     for m in range(len(bounds) - 1):
         begin, end = bounds[m] + _HEADER, bounds[m + 1]
@@ -73,11 +73,11 @@ def walk_cdr(
         if rows[0] < room[0]:
             parent[0, rows[0]] = m
         rows[0] += 1
-        good = end >= begin and data[bounds[m]] == 0 and data[bounds[m] + 1] in (0, 1, 6, 7)
-        swapped = good and data[bounds[m] + 1] in (0, 6)
-        most = 4 if good and data[bounds[m] + 1] >= 6 else 8  # XCDR2 aligns to four bytes at most
+        is_valid = end >= begin and data[bounds[m]] == 0 and data[bounds[m] + 1] in (0, 1, 6, 7)
+        swapped = is_valid and data[bounds[m] + 1] in (0, 6)
+        most = 4 if is_valid and data[bounds[m] + 1] >= 6 else 8  # XCDR2 aligns to four bytes at most
         offset, pc, depth, mark = begin, 0, 0, begin
-        while good:
+        while is_valid:
             op, a, b, c = program[pc, 0], program[pc, 1], program[pc, 2], program[pc, 3]
             pc += 1
             if op in (SKIP, TAKE, BYTES):
@@ -86,7 +86,7 @@ def walk_cdr(
                 offset += -(offset - begin) % step
                 size = b if op == SKIP else a
                 if size > end - offset:
-                    good = False
+                    is_valid = False
                     break
                 if op != SKIP:
                     slot = b
@@ -100,10 +100,10 @@ def walk_cdr(
                             lengths[first[slot] + row] = a
                 offset += size
             elif op == NEXT:
-                left[depth - 1] -= 1
-                if left[depth - 1] > 0:
+                items_left[depth - 1] -= 1
+                if items_left[depth - 1] > 0:
                     level = owner[depth - 1]
-                    pc = back[depth - 1]
+                    pc = loop_start[depth - 1]
                     if level >= 0:
                         rows[level] += 1
                         if rows[level] <= room[level]:
@@ -118,10 +118,10 @@ def walk_cdr(
                 if most == 4:
                     offset += -(offset - begin) % 4 + 4
                     if offset > end:
-                        good = False
+                        is_valid = False
                         break
             elif op == END:
-                good = end - offset <= _SPARE
+                is_valid = end - offset <= _SPARE
                 break
             else:
                 if op == ARRAY:
@@ -129,14 +129,14 @@ def walk_cdr(
                 else:
                     offset += -(offset - begin) % 4
                     if end - offset < 4:
-                        good = False
+                        is_valid = False
                         break
                     number, stop, level = np.int64(_read_number(data, offset, 4, swapped)), a, b
                     offset += 4
                 if op == TEXT:
                     size = number * b
                     if size > end - offset:
-                        good = False
+                        is_valid = False
                         break
                     if a >= 0:
                         row = rows[c] - 1
@@ -148,16 +148,16 @@ def walk_cdr(
                     if number > 0:
                         offset += -(offset - begin) % min(a, most)
                     if number > (end - offset) // a:
-                        good = False
+                        is_valid = False
                         break
                     offset += number * a
                 elif number == 0:
                     pc = stop
                 else:
                     if number > end - offset:  # an item is a byte at least
-                        good = False
+                        is_valid = False
                         break
-                    back[depth], left[depth], owner[depth] = pc, number, level
+                    loop_start[depth], items_left[depth], owner[depth] = pc, number, level
                     if level >= 0:
                         rows[level] += 1
                         if rows[level] <= room[level]:
@@ -168,7 +168,7 @@ def walk_cdr(
                                     break
                             parent[level, rows[level] - 1] = rows[inner] - 1
                     depth += 1
-        if not good:
+        if not is_valid:
             rows[:] = before
     return rows
 
@@ -186,15 +186,15 @@ BASE, NAME, FIXED_ARRAY, SEQUENCE = 1, 2, 3, 4
 """rosbags' kinds of node."""
 
 
-def find_message_fields(types: Any, name: str, of: str) -> list[tuple[str, Any]]:
-    """The fields of a type, which the definition `of` a message may lack. Raises DefinitionError."""
-    return list(types[resolve_type_name(name, types, of)][1])
+def find_message_fields(types: Any, name: str, message: str) -> list[tuple[str, Any]]:
+    """The fields of a type, which the definition `message` a message may lack. Raises DefinitionError."""
+    return list(types[resolve_type_name(name, types, message)][1])
 
 
-def resolve_type_name(name: str, types: Any, of: str) -> str:
-    """The name of a type. Raises DefinitionError where the definition `of` a message lacks it."""
+def resolve_type_name(name: str, types: Any, message: str) -> str:
+    """The name of a type. Raises DefinitionError where the definition `message` a message lacks it."""
     if name not in types:
-        raise DefinitionError(f"the definition of {of} lacks {name}")
+        raise DefinitionError(f"the definition of {message} lacks {name}")
     return name
 
 
@@ -208,16 +208,16 @@ def base_type(name: str) -> str:
 class CdrProgram:
     """The program for the messages of a type, which takes the columns of the paths `wanted`."""
 
-    def __init__(self, types: Any, wanted: Sequence[str], levels: Sequence[str]) -> None:
+    def __init__(self, types: Any, paths: Sequence[str], levels: Sequence[str]) -> None:
         self._types = types
-        self._column = {path: k for k, path in enumerate(wanted)}
+        self._column = {path: k for k, path in enumerate(paths)}
         self._level = {name: k for k, name in enumerate(levels)}
         self._picked: dict[str, list[int]] = {}
-        for array, item in map(split_chosen_item, wanted):
+        for array, item in map(split_chosen_item, paths):
             if item >= 0:
                 self._picked.setdefault(array, []).append(item)
         self._rows: list[list[int]] = []
-        self.kinds: dict[str, ValueKind] = {}  # by wanted path
+        self.kinds: dict[str, ValueKind] = {}  # by path
 
     def finished(self) -> Int:
         """The program of I instructions, (I, 4)."""
@@ -344,30 +344,30 @@ class CdrDefinition(Definition):
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
         """The columns of messages. Raises KeyError for a path that is neither offered nor picked; OversizeError."""
-        wanted = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
-        builder = CdrProgram(self._types, wanted, list_levels(wanted))
+        paths = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
+        builder = CdrProgram(self._types, paths, list_levels(paths))
         builder.add_type(self._name, "")
         program = builder.finished()
-        kinds = {path: builder.kinds[path] for path in wanted}
+        kinds = {path: builder.kinds[path] for path in paths}
 
         def walk(
-            data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, said: Bool,
+            data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, present: Bool,
             parent: Int,
         ) -> Int:  # fmt: skip
-            said[:] = True
+            present[:] = True
             return walk_cdr(data, bounds, program, first, room, bits, lengths, parent)
 
         batches = ((np.arange(batch.start, batch.stop), payloads[batch]) for batch in split_batches(payloads))
         return walk_columns(walk, batches, kinds, numbers, texts, len(payloads))
 
-    def _explore(self, name: str, path: str, inside: tuple[str, ...]) -> None:
+    def _explore(self, name: str, path: str, outer_types: tuple[str, ...]) -> None:
         """Add all leaves below a type to the offered ones. Raises DefinitionError: nested without end, or too many."""
-        if name in inside or len(inside) > _DEEPEST:
+        if name in outer_types or len(outer_types) > _DEEPEST:
             raise DefinitionError(f"the definition of {self._name} is nested without end ({name})")
         for field, node in find_message_fields(self._types, name, self._name):
-            self._explore_node(node, f"{path}.{field}" if path else field, (*inside, name))
+            self._explore_node(node, f"{path}.{field}" if path else field, (*outer_types, name))
 
-    def _explore_node(self, node: Any, path: str, inside: tuple[str, ...]) -> None:
+    def _explore_node(self, node: Any, path: str, outer_types: tuple[str, ...]) -> None:
         self._explored += 1
         if self._explored > _MOST_FIELDS:
             raise DefinitionError(f"the definition of {self._name} has more than {_MOST_FIELDS} fields")
@@ -375,7 +375,7 @@ class CdrDefinition(Definition):
         if kind == BASE:
             self._offers[path] = "text" if base_type(detail[0]) == STRING_TYPE else "number"
         elif kind == NAME:
-            self._explore(resolve_type_name(detail, self._types, self._name), path, inside)
+            self._explore(resolve_type_name(detail, self._types, self._name), path, outer_types)
         else:
             item, number = detail
             if kind == FIXED_ARRAY and not 0 < number <= _LONGEST_ARRAY:
@@ -384,7 +384,7 @@ class CdrDefinition(Definition):
                 self._offers[path] = "text"  # as one: an id, say
             if item[0] == BASE and item[1][0] in BASES and kind == FIXED_ARRAY:
                 self._arrays[path] = number
-            self._explore_node(item, f"{path}[]", inside)
+            self._explore_node(item, f"{path}[]", outer_types)
 
 
 _SEPARATOR = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)

@@ -34,13 +34,13 @@ def put_cdr(
     out: NDArray[np.uint8], sizes: Int, program: Int, first: Int, step: Int, cells: NDArray[np.uint64],
     pool: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """The sizes of messages (N,); and their bytes, one after the other in `out`, which has zeros: if it is not empty.
+    """Sizes of messages (N,); and their bytes, one after the other in the zeroed `out`, unless it is empty.
 
     In row r column c has the cells from `first[c] + step[c] * r` on: its numbers' bits; of a text its place in `pool`
     and its length; of a list its first row and how many it has.
     """
-    back = np.zeros(DEEPEST, dtype=np.int64)  # of each list that is open: instruction after its head
-    left = np.zeros(DEEPEST, dtype=np.int64)  # its items still to come
+    loop_start = np.zeros(DEEPEST, dtype=np.int64)  # of each list that is open: instruction after its head
+    items_left = np.zeros(DEEPEST, dtype=np.int64)  # its items still to come
     row = np.zeros(DEEPEST + 1, dtype=np.int64)  # where it is; the first is the message
     puts, offset = len(out) > 0, 0
     for m in range(len(sizes)):
@@ -65,10 +65,10 @@ def put_cdr(
                             out[offset + size * k + i] = np.uint8(cells[place + k] >> np.uint64(8 * i))
                 offset += size * number
             elif op == NEXT:
-                left[depth - 1] -= 1
-                if left[depth - 1] > 0:
+                items_left[depth - 1] -= 1
+                if items_left[depth - 1] > 0:
                     row[depth] += 1
-                    pc = back[depth - 1]
+                    pc = loop_start[depth - 1]
                 else:
                     depth -= 1
             elif op == END:
@@ -89,7 +89,7 @@ def put_cdr(
                 elif length == 0:
                     pc = size
                 else:
-                    back[depth], left[depth] = pc, length
+                    loop_start[depth], items_left[depth] = pc, length
                     depth += 1
                     row[depth] = np.int64(cells[place])
         sizes[m] = offset - begin + 4
@@ -160,12 +160,12 @@ class _Program:
 
 def encode_cdr(name: str, content: Content, rows: int) -> list[bytes]:
     """One encoded message for each row; `name`: of the type, `package/msg/Type`."""
-    made = _Program()
-    made.add_type(name.replace("/msg/", "/"), content)
-    program = np.array([*made.rows, [END, 0, 0, 0]], dtype=np.int64)
-    cells, step = np.concatenate(made.cells), np.array(made.step, dtype=np.int64)
-    first = np.cumsum([0, *map(len, made.cells)], dtype=np.int64)
-    pool = np.concatenate([np.zeros(0, dtype=np.uint8), *made.pool])
+    built = _Program()
+    built.add_type(name.replace("/msg/", "/"), content)
+    program = np.array([*built.rows, [END, 0, 0, 0]], dtype=np.int64)
+    cells, step = np.concatenate(built.cells), np.array(built.step, dtype=np.int64)
+    first = np.cumsum([0, *map(len, built.cells)], dtype=np.int64)
+    pool = np.concatenate([np.zeros(0, dtype=np.uint8), *built.pool])
     sizes = np.zeros(rows, dtype=np.int64)
     put_cdr(np.zeros(0, dtype=np.uint8), sizes, program, first, step, cells, pool)
     out = np.zeros(sizes.sum(), dtype=np.uint8)

@@ -274,9 +274,9 @@ Content: TypeAlias = Mapping[str, "float | NDArray[Any] | RowTexts | Instants | 
 message, the messages of a repeated field. A field that is left out has its default in all rows."""
 
 
-def optional_message(said: Bool, content: Content | Instants) -> RepeatedMessages:
-    """A message in the rows `said` (N,) only; `content` has these rows alone."""
-    return RepeatedMessages(start_offsets(said), content)
+def optional_message(is_stated: Bool, content: Content | Instants) -> RepeatedMessages:
+    """A message in the rows `is_stated` (N,) only; `content` has these rows alone."""
+    return RepeatedMessages(start_offsets(is_stated), content)
 
 
 # Protobuf messages, with the bytes of `SerializeToString(deterministic=True)`.
@@ -293,11 +293,11 @@ def _encode_fields(descriptor: Descriptor, content: Content | Instants, rows: in
     """The parts of a message: its fields in the order of their numbers; without repeated ones that no row has."""
     if isinstance(content, Instants):
         content = dict(zip(("seconds", "nanos"), np.divmod(content.time_ns, 1_000_000_000), strict=True))
-    there = {
+    present = {
         name: value for name, value in content.items() if not isinstance(value, RepeatedMessages) or value.start[-1]
     }
-    fields = sorted((descriptor.fields_by_name[name] for name in there), key=lambda field: field.number)
-    return [_encode_field(field, there[field.name], rows) for field in fields]
+    fields = sorted((descriptor.fields_by_name[name] for name in present), key=lambda field: field.number)
+    return [_encode_field(field, present[field.name], rows) for field in fields]
 
 
 def _is_constant(value: Any) -> bool:

@@ -27,7 +27,7 @@ from copem_replay.io.decoded_size import check_decoded_bytes
 
 @dataclass(frozen=True)
 class DistinctTexts:
-    """R texts, each distinct one kept once."""
+    """R texts, each distinct one stored once."""
 
     code: Int  # (R,) index into words; −1: not said
     words: tuple[str, ...]
@@ -74,11 +74,11 @@ class Definition(ABC):
 
     def _known(self, paths: Iterable[str]) -> list[str]:
         """The paths, each once. Raises KeyError for one that is neither offered nor picked."""
-        wanted = list(dict.fromkeys(paths))
-        for path in wanted:
+        unique = list(dict.fromkeys(paths))
+        for path in unique:
             if path not in self._offers and not self.picks(path):
                 raise KeyError(path)
-        return wanted
+        return unique
 
 
 def shred_messages(
@@ -90,25 +90,25 @@ def shred_messages(
     `sensors[0].objects[].x` of `sensors[0].objects[]`. Raises KeyError for a path that is not offered.
     """
     numbers, texts = tuple(numbers), tuple(texts)
-    picked = [p for p in dict.fromkeys((*numbers, *texts)) if _ITEM.search(p) and not definition.picks(p)]
-    whole = [[any_item_path(p) if p in picked else p for p in paths] for paths in (numbers, texts)]
-    shredded = definition.shred(payloads, *whole)
+    item_paths = [p for p in dict.fromkeys((*numbers, *texts)) if _ITEM.search(p) and not definition.picks(p)]
+    source_paths = [[any_item_path(p) if p in item_paths else p for p in paths] for paths in (numbers, texts)]
+    shredded = definition.shred(payloads, *source_paths)
     levels = dict(shredded.levels)
-    chosen: dict[str, Int] = {}
-    for path in picked:
+    chosen_rows: dict[str, Int] = {}
+    for path in item_paths:
         level = list_level(path)
-        _choose_level(levels, chosen, level)
+        _choose_level(levels, chosen_rows, level)
         source = list_level(any_item_path(path))
         rows = np.arange(len(levels[source].parent))
         ancestors, inner = rows, source
         for step in reversed(_chosen_items(path)):
-            good = _place_in_parent(levels[inner].parent)[ancestors] == step
-            rows, ancestors = rows[good], levels[inner].parent[ancestors[good]]
+            is_item = _place_in_parent(levels[inner].parent)[ancestors] == step
+            rows, ancestors = rows[is_item], levels[inner].parent[ancestors[is_item]]
             inner = parent_level(inner)
         target_rows = ancestors
-        if level in chosen:  # its rows are some of those of the whole level
+        if level in chosen_rows:  # its rows are some of those of the whole level
             number = np.full(len(levels[inner].parent), -1)
-            number[chosen[level]] = np.arange(len(chosen[level]))
+            number[chosen_rows[level]] = np.arange(len(chosen_rows[level]))
             target_rows = number[ancestors]
             rows, target_rows = rows[target_rows >= 0], target_rows[target_rows >= 0]
         levels[level] = _add_items(levels[level], levels[source], path, target_rows, rows)
@@ -147,25 +147,25 @@ def _chosen_items(path: str) -> list[int]:
     return [int(k) for k in _ITEM.findall(path[len(list_level(path)) :])]
 
 
-def _choose_level(levels: dict[str, LevelRows], chosen: dict[str, Int], name: str) -> None:
-    """Add the level `name`, and those above it, with the rows in the items that it names; `chosen` gets these rows."""
+def _choose_level(levels: dict[str, LevelRows], chosen_rows: dict[str, Int], name: str) -> None:
+    """Add the level `name` and its parents, with only the rows of the list items in its path, also to `chosen_rows`."""
     if name in levels:
         return
     outer = parent_level(name)
-    _choose_level(levels, chosen, outer)
-    whole = any_item_path(name)
-    rows = np.arange(len(levels[whole].parent))
-    ancestors, inner = levels[whole].parent, parent_level(whole)
+    _choose_level(levels, chosen_rows, outer)
+    all_items = any_item_path(name)
+    rows = np.arange(len(levels[all_items].parent))
+    ancestors, inner = levels[all_items].parent, parent_level(all_items)
     for step in reversed(_chosen_items(name.removesuffix("[]"))):
-        good = _place_in_parent(levels[inner].parent)[ancestors] == step
-        rows, ancestors = rows[good], levels[inner].parent[ancestors[good]]
+        matches = _place_in_parent(levels[inner].parent)[ancestors] == step
+        rows, ancestors = rows[matches], levels[inner].parent[ancestors[matches]]
         inner = parent_level(inner)
-    if outer in chosen:
+    if outer in chosen_rows:
         number = np.full(len(levels[inner].parent), -1)
-        number[chosen[outer]] = np.arange(len(chosen[outer]))
-        good = number[ancestors] >= 0
-        rows, ancestors = rows[good], number[ancestors[good]]
-    levels[name], chosen[name] = LevelRows(ancestors, {}, {}), rows
+        number[chosen_rows[outer]] = np.arange(len(chosen_rows[outer]))
+        matches = number[ancestors] >= 0
+        rows, ancestors = rows[matches], number[ancestors[matches]]
+    levels[name], chosen_rows[name] = LevelRows(ancestors, {}, {}), rows
 
 
 def _place_in_parent(parent: Int) -> Int:
@@ -174,16 +174,16 @@ def _place_in_parent(parent: Int) -> Int:
     return np.arange(len(parent)) - np.repeat(first, np.diff(np.append(first, len(parent))))
 
 
-def _add_items(target: LevelRows, source: LevelRows, path: str, to: Int, of: Int) -> LevelRows:
-    """`target` with the column `path` added: rows `of` the source at rows `to`."""
-    numbers, texts, whole = dict(target.numbers), dict(target.texts), any_item_path(path)
-    if whole in source.numbers:
+def _add_items(target: LevelRows, source: LevelRows, path: str, target_rows: Int, source_rows: Int) -> LevelRows:
+    """`target` with the column `path` added: rows `source_rows` the source at rows `target_rows`."""
+    numbers, texts, array_path = dict(target.numbers), dict(target.texts), any_item_path(path)
+    if array_path in source.numbers:
         numbers[path] = np.full(len(target.parent), np.nan)
-        numbers[path][to] = source.numbers[whole][of]
-    if whole in source.texts:
+        numbers[path][target_rows] = source.numbers[array_path][source_rows]
+    if array_path in source.texts:
         code = np.full(len(target.parent), -1)
-        code[to] = source.texts[whole].code[of]
-        texts[path] = DistinctTexts(code, source.texts[whole].words)
+        code[target_rows] = source.texts[array_path].code[source_rows]
+        texts[path] = DistinctTexts(code, source.texts[array_path].words)
     return LevelRows(target.parent, numbers, texts)
 
 
@@ -228,15 +228,15 @@ def ancestor_rows(shredded: ShreddedMessages, level: str, ancestor: str) -> NDAr
     return row
 
 
-def common_level(one: str, other: str) -> str:
+def common_level(level: str, second: str) -> str:
     """The innermost level that both levels are in."""
-    around = {one, ""}
-    while one:
-        one = parent_level(one)
-        around.add(one)
-    while other not in around:
-        other = parent_level(other)
-    return other
+    outer_levels = {level, ""}
+    while level:
+        level = parent_level(level)
+        outer_levels.add(level)
+    while second not in outer_levels:
+        second = parent_level(second)
+    return second
 
 
 # Raw values of messages, the bits of numbers and the bytes of texts, made into columns.
@@ -269,9 +269,9 @@ class _RawColumn:
         self._said: list[Bool] = []
         self._code_of: dict[bytes, int] = {}
 
-    def add(self, data: bytes, bits: Any, lengths: Int, said: Bool) -> None:
-        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`, and where there is one."""
-        self._said.append(said)
+    def add(self, data: bytes, bits: Any, lengths: Int, is_present: Bool) -> None:
+        """Add a batch: bits of numbers, or places of texts in `data` and their `lengths`; which rows have a value."""
+        self._said.append(is_present)
         if self._kind.is_number:
             self._values.append(_decode_numbers(bits, self._kind.how))
             return
@@ -340,11 +340,11 @@ def walk_columns(
     rows = np.zeros(len(names), dtype=np.int64)
     for number, payloads in batches:
         data = b"".join(payloads)
-        batch_rows, taken, parent = _walk_batch(walk, data, list(map(len, payloads)), level_ix, len(names))
+        batch_rows, batch_columns, parent = _walk_batch(walk, data, list(map(len, payloads)), level_ix, len(names))
         for k, name in enumerate(names):
-            of = parent[k, : batch_rows[k]]
-            parents[name].append(of + rows[names.index(parent_level(name))] if name else number[of])
-        for column, values in zip(columns.values(), taken, strict=True):
+            owner = parent[k, : batch_rows[k]]
+            parents[name].append(owner + rows[names.index(parent_level(name))] if name else number[owner])
+        for column, values in zip(columns.values(), batch_columns, strict=True):
             column.add(data, *values)
         rows += batch_rows
     levels = {name: LevelRows(join_arrays(parts, np.int64), {}, {}) for name, parts in parents.items()}
@@ -367,16 +367,16 @@ def _walk_batch(
 
     def walk_into(room: Int, size: int, most: int) -> tuple[Int, Any, Int, Bool, Int]:
         bits, lengths = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
-        said, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
-        return walk(octets, bounds, first, room, bits, lengths, said, parent), bits, lengths, said, parent
+        is_present, parent = np.zeros(size, dtype=bool), np.empty((levels, most), dtype=np.int64)
+        return walk(octets, bounds, first, room, bits, lengths, is_present, parent), bits, lengths, is_present, parent
 
     rows = walk_into(np.zeros(levels, dtype=np.int64), 0, 0)[0]  # counts them
     most = int(rows.max(initial=0))
     np.cumsum(rows[level_ix], out=first[1:])
     check_decoded_bytes(COLUMN_BYTES * int(first[-1]) + 8 * levels * most)
-    _, bits, lengths, said, parent = walk_into(rows, int(first[-1]), most)
+    _, bits, lengths, is_present, parent = walk_into(rows, int(first[-1]), most)
     parts = [slice(*ends) for ends in pairwise(first.tolist())]
-    return rows, [(bits[p], lengths[p], said[p]) for p in parts], parent
+    return rows, [(bits[p], lengths[p], is_present[p]) for p in parts], parent
 
 
 def join_arrays(parts: Sequence[Any], kind: Any) -> Any:

@@ -56,13 +56,13 @@ class JsonDefinition(Definition):
             check_json(payload)
         self._filled: dict[str, bool] = {}  # of each list, whether a message had something in it
         telling = 0
-        later: Sequence[bytes] = ()
+        more_samples: Sequence[bytes] = ()
         for number, payload in enumerate(samples[:_LOOKED_AT_MOST], 1):
             telling += self._look_at(payload)
             if telling == _LOOKED_AT:
-                later = samples[number:]
+                more_samples = samples[number:]
                 break
-        for payload in later[:: max(1, len(later) // _LATER)]:
+        for payload in more_samples[:: max(1, len(more_samples) // _LATER)]:
             if all(self._filled.values()):
                 break
             self._look_at(payload)
@@ -245,15 +245,15 @@ def _convert_number(value: Any) -> float:
 def _plan_places(numbers: Sequence[str], texts: Sequence[str]) -> _WantedPlace:
     root = _WantedPlace("")
     for path, is_text in (*((p, False) for p in numbers), *((p, True) for p in texts)):
-        place, here = root, ""
+        place, prefix = root, ""
         for part in path.split("."):
             name = part.rstrip("[]")
             if name:
-                here = f"{here}.{name}" if here else name
+                prefix = f"{prefix}.{name}" if prefix else name
                 place = place.fields.setdefault(name, _WantedPlace(place.level))
             for _ in range(part.count("[]")):
-                here += "[]"
-                place.item = place.item or _WantedPlace(here)
+                prefix += "[]"
+                place.item = place.item or _WantedPlace(prefix)
                 place = place.item
         if is_text:
             place.text = path

@@ -109,7 +109,7 @@ def _skip_plain_value(data: NDArray[np.uint8], offset: Any, end: Any, wire: Any)
 @kernel
 def walk_protobuf(
     data: NDArray[np.uint8], bounds: Int, fields: Int, node_first: Int, node_level: Int, blank: Int, blank_first: Int,
-    first: Int, room: Int, bits: Any, lengths: Int, said: Bool, parent: Int,
+    first: Int, room: Int, bits: Any, lengths: Int, is_present: Bool, parent: Int,
 ) -> Int:  # fmt: skip
     """As `Walk`. A message of kind n has `fields[node_first[n]:node_first[n + 1]]` and is of level `node_level[n]`.
 
@@ -132,7 +132,7 @@ def walk_protobuf(
                 row = rows[node_level[node]] - 1
                 if row < room[node_level[node]]:
                     for k in range(blank_first[node], blank_first[node + 1]):
-                        said[first[blank[k]] + row] = True
+                        is_present[first[blank[k]] + row] = True
             if offset >= end:
                 offset, depth = end, depth - 1
                 continue
@@ -152,17 +152,17 @@ def walk_protobuf(
                 after = _skip_value(data, offset, end, wire)
             if after > end:
                 break
-            found = -1
+            field = -1
             for k in range(node_first[node], node_first[node + 1]):
                 if fields[k, NUMBER] == number:
-                    found = k
+                    field = k
                     break
-            if found < 0:
+            if field < 0:
                 offset = after
                 continue
-            what, column, level, into = fields[found, 1], fields[found, 2], fields[found, 3], fields[found, 4]
-            if what in (MESSAGE, GROUP):
-                if wire != (GROUP if what == GROUP else BYTES) or depth + 1 == DEEPEST:
+            kind, column, level, inner_node = fields[field, 1], fields[field, 2], fields[field, 3], fields[field, 4]
+            if kind in (MESSAGE, GROUP):
+                if wire != (GROUP if kind == GROUP else BYTES) or depth + 1 == DEEPEST:
                     offset = after
                     continue
                 if level >= 0:
@@ -170,31 +170,31 @@ def walk_protobuf(
                         parent[level, rows[level]] = rows[node_level[node]] - 1
                     rows[level] += 1
                 depth += 1
-                ends[depth], nodes[depth], offset, entered = after, into, begin, True
+                ends[depth], nodes[depth], offset, entered = after, inner_node, begin, True
                 continue
-            if what == wire or (wire == BYTES and level >= 0):  # one value, or many in one
+            if kind == wire or (wire == BYTES and level >= 0):  # one value, or many in one
                 while True:
                     value, next_at = np.uint64(begin), after
-                    if what == VARINT:
+                    if kind == VARINT:
                         value, next_at = _read_varint(data, begin, after)
-                    elif what != BYTES:
-                        next_at = begin + (8 if what == FIXED64 else 4)
-                    if next_at > after or (wire != what and begin == after):
+                    elif kind != BYTES:
+                        next_at = begin + (8 if kind == FIXED64 else 4)
+                    if next_at > after or (wire != kind and begin == after):
                         break
-                    if what == FIXED64:
+                    if kind == FIXED64:
                         value = _read_fixed(data, begin, 8)
-                    elif what == FIXED32:
+                    elif kind == FIXED32:
                         value = _read_fixed(data, begin, 4)
-                    of = node_level[node]
+                    row_level = node_level[node]
                     if level >= 0:
-                        of = level
+                        row_level = level
                         if rows[level] < room[level]:
                             parent[level, rows[level]] = rows[node_level[node]] - 1
                         rows[level] += 1
-                    if rows[of] - 1 < room[of]:
-                        place = first[column] + rows[of] - 1
-                        bits[place], said[place] = value, True
-                        if what == BYTES:
+                    if rows[row_level] - 1 < room[row_level]:
+                        place = first[column] + rows[row_level] - 1
+                        bits[place], is_present[place] = value, True
+                        if kind == BYTES:
                             lengths[place] = after - begin
                     begin = next_at
                     if begin >= after:
@@ -269,8 +269,8 @@ class ProtobufSize:
     def __init__(self, descriptor: Any) -> None:
         number_of = {descriptor.full_name: 0}
         descriptors, fields, first, sizes = [descriptor], list[tuple[int, int, int]](), [0], []
-        for one in descriptors:  # it grows
-            for field in sorted(one.fields, key=lambda field: field.number):
+        for message in descriptors:  # it grows
+            for field in sorted(message.fields, key=lambda field: field.number):
                 inner = field.message_type
                 if inner is not None and inner.full_name not in number_of:
                     number_of[inner.full_name] = len(descriptors)
@@ -278,7 +278,7 @@ class ProtobufSize:
                 kind = _INSIDE if inner is not None else _TEXT if field.type in _TEXT_TYPES else _NUMBER
                 fields.append((field.number, kind, number_of[inner.full_name] if inner is not None else -1))
             first.append(len(fields))
-            sizes.append(_MESSAGE_BYTES + _FIELD_BYTES * len(one.fields))
+            sizes.append(_MESSAGE_BYTES + _FIELD_BYTES * len(message.fields))
         self._fields: Int = np.array(fields, dtype=np.int64).reshape(-1, 3)
         self._first: Int = np.array(first, dtype=np.int64)
         self._sizes: Int = np.array(sizes, dtype=np.int64)
@@ -379,19 +379,19 @@ class ProtobufDefinition(Definition):
         """Add all leaves to the offered ones, those of outer messages first: definitions may refer to themselves."""
         level = [(root, "")]
         for _ in range(_DEEPEST):
-            below = []
+            inner = []
             for descriptor, path in level:
                 for field in descriptor.fields:
-                    here = (f"{path}.{field.name}" if path else field.name) + ("[]" if field.is_repeated else "")
+                    leaf = (f"{path}.{field.name}" if path else field.name) + ("[]" if field.is_repeated else "")
                     if field.message_type is None:
-                        self._offers[here] = "number" if _TYPES[field.type][0] != BYTES else "text"
+                        self._offers[leaf] = "number" if _TYPES[field.type][0] != BYTES else "text"
                         if field.enum_type is not None:
-                            self._names[here] = _enum_names(field)
+                            self._names[leaf] = _enum_names(field)
                     elif not field.message_type.GetOptions().map_entry:
-                        below.append((field.message_type, here))
-                if len(self._offers) + len(below) > _MOST_FIELDS:
+                        inner.append((field.message_type, leaf))
+                if len(self._offers) + len(inner) > _MOST_FIELDS:
                     return
-            level = below
+            level = inner
 
 
 class _FieldTable:
@@ -401,33 +401,33 @@ class _FieldTable:
     which may hide one that is known.
     """
 
-    def __init__(self, root: Any, wanted: Sequence[str]) -> None:
+    def __init__(self, root: Any, paths: Sequence[str]) -> None:
         self.kinds: dict[str, ValueKind] = {}
         self.closed = False
-        levels = list_levels(wanted)
+        levels = list_levels(paths)
         nodes: list[tuple[Any, str]] = [(root, "")]
         node_of = {"": 0}
         fields: list[list[list[int]]] = [[]]
         blank: list[list[int]] = [[]]
-        for column, path in enumerate(wanted):
-            node, here = 0, ""
+        for column, path in enumerate(paths):
+            node, reached = 0, ""
             for part in path.split("."):
-                here = f"{here}.{part}" if here else part
+                reached = f"{reached}.{part}" if reached else part
                 field = nodes[node][0].fields_by_name[part.removesuffix("[]")]
-                level = levels.index(here) if field.is_repeated else -1
+                level = levels.index(reached) if field.is_repeated else -1
                 if field.message_type is None:
                     fields[node].append([field.number, _TYPES[field.type][0], column, level, -1])
                     if not field.is_repeated and not field.has_presence:
                         blank[node].append(column)
                     continue
-                if here not in node_of:
-                    what = GROUP if field.type == FieldDescriptor.TYPE_GROUP else MESSAGE
-                    node_of[here] = len(nodes)
-                    fields[node].append([field.number, what, -1, level, len(nodes)])
-                    nodes.append((field.message_type, here))
+                if reached not in node_of:
+                    kind = GROUP if field.type == FieldDescriptor.TYPE_GROUP else MESSAGE
+                    node_of[reached] = len(nodes)
+                    fields[node].append([field.number, kind, -1, level, len(nodes)])
+                    nodes.append((field.message_type, reached))
                     fields.append([])
                     blank.append([])
-                node = node_of[here]
+                node = node_of[reached]
             self.kinds[path] = ValueKind(_TYPES[field.type][1], _enum_names(field) if field.enum_type else {})
             self.closed |= field.enum_type is not None and field.enum_type.is_closed
         self.fields = np.array([row for rows in fields for row in rows], dtype=np.int64).reshape(-1, 5)
@@ -437,12 +437,12 @@ class _FieldTable:
         self.blank_first = np.cumsum([0, *map(len, blank)], dtype=np.int64)
 
     def walk(
-        self, data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, said: Bool,
+        self, data: NDArray[np.uint8], bounds: Int, first: Int, room: Int, bits: Any, lengths: Int, is_present: Bool,
         parent: Int,
     ) -> Int:  # fmt: skip
         """The walk through messages as Google's parser has written them."""
         plan = (self.fields, self.node_first, self.node_level, self.blank, self.blank_first)
-        return walk_protobuf(data, bounds, *plan, first, room, bits, lengths, said, parent)
+        return walk_protobuf(data, bounds, *plan, first, room, bits, lengths, is_present, parent)
 
 
 def _enum_names(field: Any) -> dict[int, str]:

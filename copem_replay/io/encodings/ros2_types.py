@@ -154,10 +154,10 @@ def define_channels(channels: Sequence[Channel], folder: str) -> tuple[Channel, 
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store, types = get_typestore(Stores.EMPTY), dict(get_typestore(Stores.ROS2_JAZZY).fielddefs)
-    at, defined = Path(folder), list[Channel]()
+    path, defined = Path(folder), list[Channel]()
     try:
-        for at in sorted(Path(folder).rglob("*.msg")) or [Path(folder)]:
-            types |= get_types_from_msg(at.read_text(), f"{at.parent.parent.name}/msg/{at.stem}")
+        for path in sorted(Path(folder).rglob("*.msg")) or [Path(folder)]:
+            types |= get_types_from_msg(path.read_text(), f"{path.parent.parent.name}/msg/{path.stem}")
         store.register(types)
         for channel in channels:
             name, text = schema_name(channel), channel.schema_data
@@ -167,5 +167,5 @@ def define_channels(channels: Sequence[Channel], folder: str) -> tuple[Channel, 
     except Exception as error:  # whatever a parser raises at what is no definition
         why = " ".join(str(error).split())[:200] or type(error).__name__
         expected = "expected definitions of messages in a folder, `package/msg/Type.msg`"
-        raise RecordingError(f"{expected}, found none ({why})", path=at, key=("read", "definitions")) from None
+        raise RecordingError(f"{expected}, found none ({why})", path=path, key=("read", "definitions")) from None
     return tuple(defined)

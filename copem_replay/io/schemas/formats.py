@@ -153,9 +153,9 @@ def _by_model(model: Any, iscactr: Any, hexamotion: Any) -> Any:
     return np.select([model == 16, model == 17], [iscactr, hexamotion], np.nan)
 
 
-def _state(iscactr: int, hexamotion: int, of: str = "continuous_state") -> tuple[str, ...]:
+def _state(iscactr: int, hexamotion: int, quantity: str = "continuous_state") -> tuple[str, ...]:
     """The paths of the model of a state, and of a quantity where each model has it."""
-    return ("state.model_id", f"state.{of}[{iscactr}]", f"state.{of}[{hexamotion}]")
+    return ("state.model_id", f"state.{quantity}[{iscactr}]", f"state.{quantity}[{hexamotion}]")
 
 
 def perception(offers: Collection[str]) -> Description:

@@ -75,26 +75,26 @@ class WantedPaths:
         """The path from the message down, of one that is relative to an object unless it begins with `/`."""
         return path[1:] if path.startswith("/") else f"{self._fields.objects}.{path}"
 
-    def _lacks(self, key: str, path: str, what: str = "", candidates: Collection[str] = ()) -> FieldsError:
+    def _lacks(self, key: str, path: str, noun: str = "", candidates: Collection[str] = ()) -> FieldsError:
         """The error for a missing path, with similar ones of `candidates`, else of all that are offered."""
         offered = list(candidates or self._offers)
         near = difflib.get_close_matches(path, offered[:_COMPARED], n=3, cutoff=0.5)
         near += [p for p in offered if p.rpartition(".")[2] == path.rpartition(".")[2] and p not in near][:3]
         shown = near or offered[:_SHOWN]
         more = f", … ({len(offered)} in all)" if len(offered) > len(shown) else ""
-        what = f"{what} " if what else ""
+        noun = f"{noun} " if noun else ""
         return FieldsError(
-            f"read.{key}: the messages have no {what}{path!r}; they have {', '.join(shown) or 'nothing'}{more}"
+            f"read.{key}: the messages have no {noun}{path!r}; they have {', '.join(shown) or 'nothing'}{more}"
         )
 
-    def _need(self, key: str, path: str, within: str | None = None) -> str:
-        """The path. Raises FieldsError: messages do not have it, or have several values of it for one of `within`."""
+    def _need(self, key: str, path: str, owner_path: str | None = None) -> str:
+        """The path. Raises FieldsError: messages lack it, or have several values of it for one `owner_path`."""
         if any_item_path(path) not in self._offers:
             raise self._lacks(key, path)
-        if within is not None and list_level(path) not in list_levels([within]):
+        if owner_path is not None and list_level(path) not in list_levels([owner_path]):
             level = list_level(path)
             raise FieldsError(
-                f"read.{key}: {path!r} is several values for each of {list_level(within) or 'the message'}: "
+                f"read.{key}: {path!r} is several values for each of {list_level(owner_path) or 'the message'}: "
                 f"choose one, {level.removesuffix('[]') + '[0]' + path[len(level) :]!r} say"
             )
         return path
@@ -120,19 +120,19 @@ class WantedPaths:
             if fields.yaw_rad.degrees is not None:
                 numbers.append(self._of_object("yaw_rad.degrees", fields.yaw_rad.degrees))
             elif fields.yaw_rad.quaternion is not None:
-                whole = fields.yaw_rad.quaternion
-                numbers += [self._of_object("yaw_rad.quaternion", f"{whole}.{axis}") for axis in "xyzw"]
+                head = fields.yaw_rad.quaternion
+                numbers += [self._of_object("yaw_rad.quaternion", f"{head}.{axis}") for axis in "xyzw"]
         if fields.covariance is not None:
             numbers += [self._of_object("covariance", f"{fields.covariance}[{k}]") for k in (0, 1, 7)]
         if fields.id is not None:
             texts.append(self._of_object("id", fields.id))
         if (class_field := self.class_) is not None:
-            whole = self._need("class", self.path(class_field.path))
-            texts.append(whole)
+            class_path = self._need("class", self.path(class_field.path))
+            texts.append(class_path)
             if class_field.probability is not None:
-                numbers.append(self._need("class.probability", self.path(class_field.probability), whole))
+                numbers.append(self._need("class.probability", self.path(class_field.probability), class_path))
             if class_field.key is not None:
-                texts.append(self._need("class.key", self.path(class_field.key), whole))
+                texts.append(self._need("class.key", self.path(class_field.key), class_path))
         if fields.frame is not None:
             texts.append(self._of_object("frame", f"/{fields.frame}"))
         texts += [self._of_object("only", path) for path in described.only]
@@ -152,16 +152,16 @@ class WantedPaths:
     def shred(self, definition: Definition, payloads: Sequence[bytes]) -> ShreddedMessages:
         """The columns of messages, with those that are made of others."""
         plain = ([path for path in paths if path not in self.made] for paths in (self.numbers, self.texts))
-        found = shred_messages(definition, payloads, *plain)
+        shredded = shred_messages(definition, payloads, *plain)
         for name, (make, *of) in self.made.items():
-            rows, parts = found.levels[list_level(name)], [(path, list_level(path)) for path in map(self.path, of)]
-            columns = (found.levels[at].numbers[p][ancestor_rows(found, list_level(name), at)] for p, at in parts)
+            rows, parts = shredded.levels[list_level(name)], [(path, list_level(path)) for path in map(self.path, of)]
+            columns = (shredded.levels[at].numbers[p][ancestor_rows(shredded, list_level(name), at)] for p, at in parts)
             rows.numbers[name] = values = make(*columns)
             if name in self.texts:
                 distinct, code = np.unique(values, return_inverse=True)
                 words = tuple(map(format_number, distinct.tolist()))
                 rows.texts[name] = DistinctTexts(np.where(np.isnan(values), -1, code), words)
-        return found
+        return shredded
 
     def _stamp_paths(self) -> list[str]:
         stamp = self._fields.stamp
@@ -181,11 +181,11 @@ _SIZE = slice(VALUES.index("length_m"), VALUES.index("width_m") + 1)
 _SIZES = slice(VALUES.index("length_m"), VALUES.index("height_m") + 1)
 
 
-def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint: str) -> None:
+def fit_outlines(values: Float, shredded: ShreddedMessages, objects: str, footprint: str) -> None:
     """Set the box of objects in `values (P, V)` without length and width to that around their points at `footprint`."""
     level = list_level(f"{footprint}.x")
-    points = found.levels[level]
-    owner = ancestor_rows(found, level, objects)
+    points = shredded.levels[level]
+    owner = ancestor_rows(shredded, level, objects)
     least, most = (np.full((len(values), 2), end) for end in (np.inf, -np.inf))
     for k, axis in enumerate("xy"):
         along = points.numbers[f"{footprint}.{axis}"]
@@ -200,17 +200,17 @@ def fit_outlines(values: Float, found: ShreddedMessages, objects: str, footprint
     values[flat, 1] += middle[:, 0] * np.sin(yaw) + middle[:, 1] * np.cos(yaw)
 
 
-def find_largest(values: Float, meant: Bool, found: ShreddedMessages, objects: str, of: str) -> Bool:
-    """(P,) which objects `meant (P,)` are the largest of their thing in the list `of`; of equal ones the first."""
-    owner = ancestor_rows(found, objects, of)
+def find_largest(values: Float, is_meant: Bool, shredded: ShreddedMessages, objects: str, list_path: str) -> Bool:
+    """(P,) the largest object of each item of the list `list_path`, among `is_meant (P,)`; of equal ones the first."""
+    owner = ancestor_rows(shredded, objects, list_path)
     sizes = np.where(np.abs(values[:, _SIZES]) <= LONGEST_M, np.abs(values[:, _SIZES]), 0.0)
-    volume = np.where(meant, sizes.prod(axis=1), -np.inf)
+    volume = np.where(is_meant, sizes.prod(axis=1), -np.inf)
     order = np.lexsort((-volume, owner))
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(owner[order]) != 0
-    chosen = meant.copy()
-    chosen[order[~first]] = False
-    return chosen
+    is_largest = is_meant.copy()
+    is_largest[order[~first]] = False
+    return is_largest
 
 
 # What stays until a message removes it.
@@ -229,23 +229,23 @@ def find_standing(
     """
     order = np.lexsort((rank, number))
     number, rank, at_m, forever = number[order], rank[order], at_m[order], forever[order]
-    same = np.diff(number) == 0
-    until = np.append(np.where(same, rank[1:], lists), lists)
+    same_object = np.diff(number) == 0
+    until = np.append(np.where(same_object, rank[1:], lists), lists)
     key = number * lists + rank
     for rows, mine in ((removed >= 0, key), (removed < 0, rank)):
         ends = np.unique(np.where(removed[rows] < 0, 0, removed[rows]) * lists + removed_rank[rows])
         ends = np.append(ends, (number.max() + 1) * lists)
         until = np.minimum(until, rank + ends[np.searchsorted(ends, mine, side="right")] - mine)
-    same &= until[:-1] == rank[1:]  # what was removed and comes again is another thing
-    stood = same & (np.hypot(*np.diff(at_m, axis=0).T) <= _STOOD_M)
-    last, alone = np.append(~same, True), np.append(~same, True) & np.append(True, ~same)
+    same_object &= until[:-1] == rank[1:]  # what was removed and comes again is another thing
+    stood = same_object & (np.hypot(*np.diff(at_m, axis=0).T) <= _STOOD_M)
+    last, alone = np.append(~same_object, True), np.append(~same_object, True) & np.append(True, ~same_object)
     stands = np.where(last, alone | np.append(False, stood), np.append(stood, False)) & forever
     gaps = until - rank - 1
-    unsaid = int(gaps[~stands & ~last & forever].sum())
+    n_unsaid = int(gaps[~stands & ~last & forever].sum())
     gaps = np.where(stands, gaps, 0)
     check_objects(int(gaps.sum()) // max(lists, 1))
     step = np.arange(gaps.sum()) - np.repeat(np.cumsum(gaps) - gaps, gaps)
-    return np.repeat(order, gaps), np.repeat(rank + 1, gaps) + step, unsaid
+    return np.repeat(order, gaps), np.repeat(rank + 1, gaps) + step, n_unsaid
 
 
 # Decoding.
@@ -282,15 +282,15 @@ class DecodedLists:
     part: str = ""  # the recording they are from, of several of one drive
     station: Station | None = None  # that positions are relative to, in m east and north of it
 
-    def take_rows(self, kept: Bool) -> DecodedLists:
-        """The lists with the entries `kept` (P,)."""
+    def take_rows(self, keep: Bool) -> DecodedLists:
+        """The lists with the entries `keep` (P,)."""
         columns, station = self.columns, self.station
-        message = np.repeat(np.arange(len(columns.rows)), columns.rows)[kept]
-        of_rows = {name: getattr(columns, name)[kept] for name in ("object_ix", "class_ix", "values")}
-        own = {n: getattr(self, n)[kept] for n in ("frame_code", "existence", "covariance_m2", "probability")}
+        message = np.repeat(np.arange(len(columns.rows)), columns.rows)[keep]
+        of_rows = {name: getattr(columns, name)[keep] for name in ("object_ix", "class_ix", "values")}
+        own_columns = {n: getattr(self, n)[keep] for n in ("frame_code", "existence", "covariance_m2", "probability")}
         columns = replace(columns, rows=np.bincount(message, minlength=len(columns.rows)), **of_rows)
-        station = station and replace(station, after_s=station.after_s[kept])
-        return replace(self, columns=columns, station=station, **own)
+        station = station and replace(station, after_s=station.after_s[keep])
+        return replace(self, columns=columns, station=station, **own_columns)
 
 
 def decode_lists(
@@ -364,11 +364,11 @@ class _BatchReader:
         self._notes += find("stamp impossible", self._impossible)
         rows = np.flatnonzero(self._found.decoded)
         moved_ns = stamp_ns - np.where(stamped, ahead_ns, 0)
-        stamp_ns, stamped, kept, findings = settle_stamps(
-            moved_ns[rows], stamped[rows], log_time_ns[rows], ahead_ns=ahead_ns, told=self._impossible
+        stamp_ns, stamped, keep, findings = settle_stamps(
+            moved_ns[rows], stamped[rows], log_time_ns[rows], ahead_ns=ahead_ns, noted=self._impossible
         )
         self._notes += findings
-        return rows[kept], stamp_ns[kept], stamped[kept]
+        return rows[keep], stamp_ns[keep], stamped[keep]
 
     def _amount(self, amount: Amount | None, otherwise: float) -> Float:
         if isinstance(amount, str):
@@ -393,11 +393,11 @@ class _BatchReader:
         class_field = self._wanted.class_
         probability = np.zeros((rows, len(CLASSES)))
         if class_field is not None:
-            whole = self._wanted.path(class_field.path)
-            level = list_level(whole)
+            class_path = self._wanted.path(class_field.path)
+            level = list_level(class_path)
             shared = common_level(level, self._fields.objects)
-            texts = self._found.levels[level].texts[whole]
-            known_as = self._by_name(any_item_path(whole), class_field.map)
+            texts = self._found.levels[level].texts[class_path]
+            known_as = self._by_name(any_item_path(class_path), class_field.map)
             names = [word.strip() and (known_as.get(word) or class_from_name(word) or "other") for word in texts.words]
             of_word = np.array([CLASSES.index(name) if name else -1 for name in names] + [-1])
             code = of_word[texts.code]
@@ -421,9 +421,9 @@ class _BatchReader:
             np.add.at(claimed, (owner[counted], code[counted]), share[counted])
             probability = claimed[ancestor_rows(self._found, self._fields.objects, shared)]
         probability = probability[keep]
-        none = probability.sum(axis=1) <= 0
-        self._notes += find("class unsaid", 0 if none.all() else int(none.sum()))
-        probability[none, CLASSES.index("other")] = 1.0
+        no_class = probability.sum(axis=1) <= 0
+        self._notes += find("class unsaid", 0 if no_class.all() else int(no_class.sum()))
+        probability[no_class, CLASSES.index("other")] = 1.0
         normed: Float = probability / probability.sum(axis=1, keepdims=True)
         return normed
 
@@ -450,11 +450,11 @@ class _BatchReader:
 
     def _meant(self) -> Bool:
         """(P,) whether an object has the values of `only`."""
-        meant = np.ones(self.rows(self._fields.objects), dtype=bool)
+        is_meant = np.ones(self.rows(self._fields.objects), dtype=bool)
         for path, values in self._description.only.items():
             texts = self.text(path)
-            meant &= np.array([word in values for word in texts.words] + [False], dtype=bool)[texts.code]
-        return meant
+            is_meant &= np.array([word in values for word in texts.words] + [False], dtype=bool)[texts.code]
+        return is_meant
 
     def _ids(self) -> DistinctTexts | None:
         """(P,) ids; None: objects have none."""
@@ -481,16 +481,16 @@ class _BatchReader:
         stated: Bool = self.number(path) != 0
         return stated
 
-    def _shaped(self, values: Float, meant: Bool) -> Bool:
+    def _shaped(self, values: Float, is_meant: Bool) -> Bool:
         """(P,) which objects remain meant, after boxes in `values (P, V)` were set by their shapes."""
         described, objects = self._description, self._fields.objects
         if described.footprint is not None:
             fit_outlines(values, self._found, objects, self._wanted.path(described.footprint))
         if described.largest_of is None:
-            return meant
-        chosen = find_largest(values, meant, self._found, objects, described.largest_of)
-        self._notes += find("cube", int((meant & ~chosen).sum()))
-        return chosen
+            return is_meant
+        is_largest = find_largest(values, is_meant, self._found, objects, described.largest_of)
+        self._notes += find("cube", int((is_meant & ~is_largest).sum()))
+        return is_largest
 
     def _velocity(self, yaw: Float) -> tuple[Float, Float]:
         """(P,) velocities along each axis of the list's frame, NaN: not stated."""
@@ -518,13 +518,13 @@ class _BatchReader:
             axis=1,
         )
 
-    def _kept(self, meant: Bool, ids: DistinctTexts | None) -> Int:
+    def _kept(self, is_meant: Bool, ids: DistinctTexts | None) -> Int:
         """(K,) rows of the objects that are meant and, if objects have ids, have one; notes tell of the others."""
         if ids is not None:
-            nameless = (ids.code < 0) & meant
-            meant = meant & ~nameless
+            nameless = (ids.code < 0) & is_meant
+            is_meant = is_meant & ~nameless
             self._notes += find("no id", int(nameless.sum()))
-        keep = np.flatnonzero(meant)
+        keep = np.flatnonzero(is_meant)
         self._notes += find("yaw unsaid", int((~self._said("yaw")[keep]).sum()))
         return keep
 
@@ -539,20 +539,20 @@ class _BatchReader:
 
     def _station(self, message: Int, keep: Int) -> Station | None:
         """The station of the messages (F,) and of the objects `keep` (K,)."""
-        within, of = self._description.within, self._found.levels[""]
+        within, message_columns = self._description.within, self._found.levels[""]
         if not self._description.station or within is None:
             return None
-        self._notes += find("stations", max(len(of.texts[self._wanted.path(within)].words) - 1, 0))
-        place = np.stack([of.numbers["latitude_deg"], of.numbers["longitude_deg"]], axis=1)
-        return Station(place[np.searchsorted(of.parent, message)], self.number("after_s")[keep])
+        self._notes += find("stations", max(len(message_columns.texts[self._wanted.path(within)].words) - 1, 0))
+        place = np.stack([message_columns.numbers["latitude_deg"], message_columns.numbers["longitude_deg"]], axis=1)
+        return Station(place[np.searchsorted(message_columns.parent, message)], self.number("after_s")[keep])
 
     def _with_standing(
         self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float
     ) -> tuple[Int, Int]:
         """Rows of objects and the message of each, with what stands in those of `in_time` that do not repeat it."""
-        stays, paths, at = self._description.stays, self._wanted.lifetime, message[keep]
+        stays, paths, entry_message = self._description.stays, self._wanted.lifetime, message[keep]
         if stays is None or ids is None or not len(keep):
-            return keep, at
+            return keep, entry_message
         forever = np.ones(len(keep), dtype=bool)
         if paths:
             level = list_level(paths[0])
@@ -561,14 +561,14 @@ class _BatchReader:
         rank = np.full(self._messages, -1)
         rank[in_time] = np.arange(len(in_time))
         removed, since = self._removals(ids)
-        more, until, unsaid = find_standing(
-            ids.code[keep], rank[at], values[keep, :2], forever, removed, rank[since], len(in_time)
+        added, until, unsaid = find_standing(
+            ids.code[keep], rank[entry_message], values[keep, :2], forever, removed, rank[since], len(in_time)
         )
         self._notes += find("stays unsaid", unsaid)
-        self._notes += find("stands", len(more))
-        keep, at = np.append(keep, keep[more]), np.append(at, in_time[until])
-        order = np.argsort(at, kind="stable")
-        return keep[order], at[order]
+        self._notes += find("stands", len(added))
+        keep, entry_message = np.append(keep, keep[added]), np.append(entry_message, in_time[until])
+        order = np.argsort(entry_message, kind="stable")
+        return keep[order], entry_message[order]
 
     def _removals(self, ids: DistinctTexts) -> tuple[Int, Int]:
         """Things that messages remove, −1: all, and the message of each removal."""
@@ -588,14 +588,14 @@ class _BatchReader:
 
     def listed(self, log_time_ns: Int, ahead_ns: int, since_ns: int) -> DecodedLists:
         """The columns of the objects that are kept. The order of the steps is that of the notes."""
-        found, meant = self._found, self._meant()
-        self._notes += find("undecoded", int((~found.decoded).sum()))
+        shredded, is_meant = self._found, self._meant()
+        self._notes += find("undecoded", int((~shredded.decoded).sum()))
         kept_message, stamp_ns, stamped = self._settled_stamps(log_time_ns, ahead_ns)
         values = self._values()
-        meant = self._shaped(values, meant)
+        is_meant = self._shaped(values, is_meant)
         ids = self._ids()
-        keep = self._kept(meant, ids)
-        message = found.levels[""].parent[ancestor_rows(found, self._fields.objects, "")]
+        keep = self._kept(is_meant, ids)
+        message = shredded.levels[""].parent[ancestor_rows(shredded, self._fields.objects, "")]
         keep = keep[np.isin(message[keep], kept_message)]
         keep, message = self._with_standing(
             keep, message, ids, kept_message[np.argsort(stamp_ns, kind="stable")], values

@@ -169,7 +169,7 @@ class GroundTruthDecoder:
             if not self._earlier and ((road := read_road(truth)) or truth.proj_string):
                 self._earlier.append((road, truth))
             check_objects(len(truth.stationary_object))
-            self._find_standing(truth.stationary_object, told=False)
+            self._find_standing(truth.stationary_object, report=False)
 
     def columns(self) -> DecodedObjects:
         """The columns of all messages that were added; none can be added after. Raises OversizeError."""
@@ -182,12 +182,12 @@ class GroundTruthDecoder:
         counts = [(rule, number) for rule, (number, _) in sorted(self._notes.items(), key=lambda item: item[1][1])]
         notes = [note for rule, number in (*counts, ("prism", len(solids))) for note in find(rule, number)]
         logged_ns, ahead_ns = (np.array(times, dtype=np.int64) for times in (self._log_time_ns, self._ahead_ns))
-        stamp_ns, stamped, kept, findings = settle_stamps(
+        stamp_ns, stamped, keep, findings = settle_stamps(
             np.array(self._stamp_ns, dtype=np.int64),
             np.array(self._stamped, dtype=bool),
             logged_ns,
             ahead_ns=ahead_ns,
-            told=self._notes.get("stamp impossible", (0,))[0],
+            noted=self._notes.get("stamp impossible", (0,))[0],
         )
         columns = DecodedObjects(
             stamp_ns=stamp_ns,
@@ -207,7 +207,7 @@ class GroundTruthDecoder:
             hosts=tuple(self._hosts),
             notes=(*notes, *findings, *self._road.notes),
         )
-        return take_messages(columns, kept)
+        return take_messages(columns, keep)
 
     def _add_host(self, message: Any, truth: Any) -> None:
         """Add the host's id: that of the ground truth, else of the sensor view around it. An id of 0 is an id."""
@@ -268,17 +268,17 @@ class GroundTruthDecoder:
             self._class_ix.append(OTHER)
             self._values.extend(values)
 
-    def _find_standing(self, objects: Any, *, told: bool = True) -> None:
-        """Take the stationary objects of a message, with findings if they are `told`."""
+    def _find_standing(self, objects: Any, *, report: bool = True) -> None:
+        """Take the stationary objects of a message, with findings if they are `report`."""
         sent: dict[int, tuple[float, ...]] = {}
         for k, stationary in enumerate(objects):
-            at, rules = (self._messages, 1, k), list[str]()
+            place, rules = (self._messages, 1, k), list[str]()
             ident = stationary.id.value
             if ident == 0 and not stationary.HasField("id"):
                 rules.append("no id")
             else:
                 if ident not in self._solids:
-                    self._solids[ident] = self._solid(ident, stationary.base, at)
+                    self._solids[ident] = self._solid(ident, stationary.base, place)
                 if self._solids[ident] is None:
                     base = stationary.base
                     position, size = base.position, base.dimension
@@ -287,11 +287,11 @@ class GroundTruthDecoder:
                     if ident in sent:
                         rules.append("twice")
                     sent.setdefault(ident, (*state, 0.0, 0.0, size.length, size.width, size.height))
-            for rule in rules if told else ():
-                self._note(rule, at)
+            for rule in rules if report else ():
+                self._note(rule, place)
         lasting = len(self._standing.keys() - sent.keys())
         if self._standing.keys().isdisjoint(sent):
-            if lasting and told:
+            if lasting and report:
                 self._note("stands", (self._messages, 1, 0), lasting)
             sent = self._standing | sent
         self._standing = sent
@@ -301,7 +301,7 @@ class GroundTruthDecoder:
         before, first = self._notes.get(rule, (0, at))
         self._notes[rule] = before + number, min(first, at)
 
-    def _solid(self, ident: int, base: Any, at: _Place) -> Solid | None:
+    def _solid(self, ident: int, base: Any, place: _Place) -> Solid | None:
         """The prism over an object's base polygon, as high as its box; None: no base polygon, or no simple one."""
         if not base.base_polygon:
             return None
@@ -316,7 +316,7 @@ class GroundTruthDecoder:
         somewhere = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
         outline = shapely.Polygon(corners) if somewhere and 3 <= len(corners) <= _MOST_CORNERS else None
         if outline is None or not outline.is_valid or not outline.area > 0.0:
-            self._note("polygon", at)
+            self._note("polygon", place)
             return None
         if not 0.0 < height_m <= FARTHEST_M:  # a note tells of it when its box is assembled
             return None
@@ -347,14 +347,14 @@ def check_zeros(base: Any, values: tuple[float, ...]) -> tuple[tuple[float, ...]
 
     Some writers leave a number out where it is 0. Presence costs, so it is asked only of zeros.
     """
-    rules, said = [], {name: base.HasField(name) for name in dict.fromkeys(_PARTS[: len(values)])}
-    if not said["orientation"]:
+    rules, has_part = [], {name: base.HasField(name) for name in dict.fromkeys(_PARTS[: len(values)])}
+    if not has_part["orientation"]:
         rules.append("yaw unset")
-    zeros = [k for k, value in enumerate(values) if value == 0.0 and said[_PARTS[k]]]
+    zeros = [k for k, value in enumerate(values) if value == 0.0 and has_part[_PARTS[k]]]
     if any(not getattr(base, _PARTS[k]).HasField(_LEAVES[k]) for k in zeros):
         rules.append("zero unset")
-    x = values[0] if said["position"] else _NAN
-    return (x, *values[1:4], *(values[4:] if said.get("velocity", True) else (_NAN, _NAN))), rules
+    x = values[0] if has_part["position"] else _NAN
+    return (x, *values[1:4], *(values[4:] if has_part.get("velocity", True) else (_NAN, _NAN))), rules
 
 
 def osi_id(object_id: str) -> int:

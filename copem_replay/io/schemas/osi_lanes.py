@@ -55,14 +55,14 @@ def read_road(truth: Any) -> OsiRoad:
     road = OsiRoad([line for line in drawn if len(line) > 1])
     stated = sum(len(of.boundary_line) for of in (*truth.lane_boundary, *truth.logical_lane_boundary))
     road.notes += find("border point", stated - sum(len(line) for _, line in (*of_physical, *of_logical)))
-    found = [_read_logical_lane(lane, logical) for lane in truth.logical_lane]
-    if not any(found):
+    read_lanes = [_read_logical_lane(lane, logical) for lane in truth.logical_lane]
+    if not any(read_lanes):
         with_borders = (lane for lane in truth.lane if lane.classification.type != INTERSECTION)
-        found += [_read_lane(lane, physical) for lane in with_borders]
-    road.lanes += [lane for lanes in found for lane in lanes]
+        read_lanes += [_read_lane(lane, physical) for lane in with_borders]
+    road.lanes += [lane for lanes in read_lanes for lane in lanes]
     _add_crosswalks(road, truth.road_marking)
-    if without := sum(not lanes for lanes in found):
-        road.notes.append(f"{count_noun(without, 'lane')} without a left and a right border: left out")
+    if unbordered := sum(not lanes for lanes in read_lanes):
+        road.notes.append(f"{count_noun(unbordered, 'lane')} without a left and a right border: left out")
     return road
 
 
@@ -76,20 +76,20 @@ def _read_points(points: Iterable[Any]) -> Float:
 
 def _read_lane(lane: Any, boundaries: Mapping[int, Float]) -> list[Lane]:
     """A lane by its boundaries in the direction in which it is driven; none where it lacks one."""
-    of = lane.classification
-    kind = _KINDS.get(of.subtype, "other") if of.subtype > 1 else "driving"
-    if of.type != DRIVING and kind == "driving":
+    classification = lane.classification
+    kind = _KINDS.get(classification.subtype, "other") if classification.subtype > 1 else "driving"
+    if classification.type != DRIVING and kind == "driving":
         kind = "other"
-    centre = np.array([(p.x, p.y) for p in of.centerline], dtype=np.float64).reshape(-1, 2)
+    centre = np.array([(p.x, p.y) for p in classification.centerline], dtype=np.float64).reshape(-1, 2)
     centre = np.round(centre[(np.abs(centre) <= FARTHEST_M).all(axis=1)], 3)  # to mm: GEOS fails at 5e-324 m
     left, right = (
         _join_along([line for i in ids if len(line := boundaries.get(i.value, _NOWHERE)) > 1], centre)
-        for ids in (of.left_lane_boundary_id, of.right_lane_boundary_id)
+        for ids in (classification.left_lane_boundary_id, classification.right_lane_boundary_id)
     )
     if min(len(left), len(right)) < 2:  # points that are all at one place are one
         return []
     found = Lane(str(lane.id.value), kind, left, right)
-    return [found if of.centerline_is_driving_direction or kind != "driving" else found.turned()]
+    return [found if classification.centerline_is_driving_direction or kind != "driving" else found.turned()]
 
 
 def _join_along(parts: Sequence[Float], centre_m: Float) -> Float:
@@ -99,12 +99,12 @@ def _join_along(parts: Sequence[Float], centre_m: Float) -> Float:
 
         ends_m = np.array([part[[0, -1], :2] for part in parts])
         begin, end = shapely.line_locate_point(shapely.LineString(centre_m), shapely.points(ends_m)).T
-        kept, reached_m = list[Float](), -np.inf
+        ahead_parts, reached_m = list[Float](), -np.inf
         for k in np.argsort(begin, kind="stable").tolist():
             if begin[k] >= reached_m - _BESIDE_M:
-                kept.append(parts[k])
+                ahead_parts.append(parts[k])
                 reached_m = end[k]
-        parts = kept
+        parts = ahead_parts
     line = np.concatenate([_NOWHERE, *parts])
     return line[np.append(True, (np.diff(line, axis=0) != 0).any(axis=1))] if len(line) else line
 
@@ -137,19 +137,19 @@ def _cut(points: Float, start_s: float, end_s: float) -> Float:
 
 def _add_crosswalks(road: OsiRoad, markings: Iterable[Any]) -> None:
     """Add crosswalks as areas, with their outlines as lines."""
-    without = 0
+    no_extent = 0
     for marking in markings:
         if marking.classification.traffic_main_sign_type != ZEBRA or marking.classification.is_out_of_service:
             continue
         ring = next(_list_outlines(marking.base), None)
         if ring is None:
-            without += 1
+            no_extent += 1
             continue
         road.crosswalks.append(make_area(f"crosswalk {marking.id.value}", "crosswalk", ring))
         at_z = np.full(len(ring) + 1, marking.base.position.z)
         road.lines.append(np.column_stack([np.append(ring, ring[:1], axis=0), at_z]))
-    if without:
-        road.notes.append(f"{count_noun(without, 'crosswalk')} without an extent on the ground: left out")
+    if no_extent:
+        road.notes.append(f"{count_noun(no_extent, 'crosswalk')} without an extent on the ground: left out")
 
 
 def _list_outlines(base: Any) -> Iterator[Float]:
@@ -163,9 +163,9 @@ def _list_outlines(base: Any) -> Iterator[Float]:
     (cr, cp, cy), (sr, sp, sy) = (wave([turn.roll, turn.pitch, turn.yaw]) for wave in (np.cos, np.sin))
     axes = np.array([[cy * cp, sy * cp], [cy * sp * sr - sy * cr, sy * sp * sr + cy * cr],
                      [cy * sp * cr + sy * sr, sy * sp * cr - cy * sr]])  # fmt: skip
-    own = np.array([(p.x, p.y, 0.0) for p in base.base_polygon]).reshape(-1, 3)
+    polygon = np.array([(p.x, p.y, 0.0) for p in base.base_polygon]).reshape(-1, 3)
     box = np.array(np.meshgrid(*([-v / 2, v / 2] for v in (size.length, size.width, size.height)))).reshape(3, -1).T
-    for corners, hull in ((own, False), (box, True)):
+    for corners, hull in ((polygon, False), (box, True)):
         ring = np.round(corners @ axes + [at.x, at.y], 6)  # to µm: a level box has its lower corners under the upper
         if not (len(ring) > 2 and (np.abs(ring) <= FARTHEST_M).all() and abs(at.z) <= FARTHEST_M):
             continue

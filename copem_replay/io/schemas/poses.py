@@ -85,7 +85,7 @@ class Poses:
     notes: tuple[Finding, ...] = ()  # what was left out, or is not stated
 
     def take(self, rows: Int) -> Poses:
-        """Some of the poses."""
+        """The poses at these indices or in this mask."""
         names = ("stamp_ns", "position_m", "rotation", "velocity_mps", "log_time_ns")
         frame, child = (tuple(np.array(texts, dtype=object)[rows]) for texts in (self.frame, self.child))
         return replace(self, frame=frame, child=child, **{name: getattr(self, name)[rows] for name in names})
@@ -124,20 +124,20 @@ def decode_poses(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) 
         near = (np.abs(columns[:, :3]) <= FARTHEST_M).all(axis=1)
         velocity = columns[:, 7:9] if where.velocity is not None else np.full((len(columns), 2), np.nan)
         moves = np.abs(velocity).max(axis=1, initial=0.0) <= FASTEST_MPS
-    good = near & (length > 0.5) & (length < 2.0)
-    notes += find("pose", int((~good).sum()))
-    notes += find("pose velocity", int((good & ~moves).sum()) if where.velocity is not None else 0)
+    valid = near & (length > 0.5) & (length < 2.0)
+    notes += find("pose", int((~valid).sum()))
+    notes += find("pose velocity", int((valid & ~moves).sum()) if where.velocity is not None else 0)
     poses = Poses(
         stamp_ns,
         columns[:, :3],
-        columns[:, 3:7] / np.where(good, length, 1.0)[:, None],
+        columns[:, 3:7] / np.where(valid, length, 1.0)[:, None],
         np.where(moves[:, None], velocity, np.nan),
         tuple(texts[0]),
         tuple(texts[1]) if where.child else ("",) * len(columns),
         logged_ns,
         tuple(notes),
     )
-    return poses if good.all() else poses.take(np.flatnonzero(good))
+    return poses if valid.all() else poses.take(np.flatnonzero(valid))
 
 
 def _settle_each(

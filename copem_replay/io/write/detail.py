@@ -92,17 +92,17 @@ class Statuses:
         frame, number = np.repeat(np.arange(len(available_ns)), np.diff(bounds)), self._fused_tracks.fused.row_object_ix
         available_s = (available_ns - self._t0_ns) * 1e-9
         ages_s = np.fmax(0.0, available_s[frame] - self._fused_tracks.captured_s[0, rows])
-        every = np.full((len(available_ns), self._count + 1), np.nan)  # a column for each object, the last for none
-        every[frame, number[rows]] = _round_to_us(ages_s)
-        age_s = every[:, self._objects]
+        table = np.full((len(available_ns), self._count + 1), np.nan)  # a column for each object, the last for none
+        table[frame, number[rows]] = _round_to_us(ages_s)
+        age_s = table[:, self._objects]
         is_known = available_ns[:, None] >= self._known_ns - SAME_INSTANT_NS
         status = np.where(np.isnan(age_s), 0, np.where(is_known, 2, 1))
-        each: Content = {
+        objects: Content = {
             "id": self._names.at(np.tile(np.arange(len(self._objects)), len(available_ns))),
             "status": _STATUSES.at(status.ravel()),
             "age_s": np.where(np.isfinite(age_s), age_s, np.nan).ravel(),
         }
-        return RepeatedMessages(np.arange(len(available_ns) + 1) * len(self._objects), each)
+        return RepeatedMessages(np.arange(len(available_ns) + 1) * len(self._objects), objects)
 
 
 def _round_to_us(time_s: Float) -> Float:
@@ -260,12 +260,12 @@ class DetailWriter:
         """The entries that the objects of some rows were made of."""
         received, view = self._fused_tracks.received, self._fused_tracks.view
         start, places = expand_ranges(self._fused_tracks.used_start, rows)
-        used = self._fused_tracks.used[places]
+        entry_rows = self._fused_tracks.used[places]
         return {
-            "units": RepeatedMessages(start, self._units.at(received.row_unit_ix[used])),
-            "captured_ns": RepeatedMessages(start, received.stamp_ns[received.frame_ix[used]]),
-            "range_m": RepeatedMessages(start, None if view is None else view.range_m[used]),
-            "visible_share": RepeatedMessages(start, None if view is None else view.visible_share[used]),
+            "units": RepeatedMessages(start, self._units.at(received.row_unit_ix[entry_rows])),
+            "captured_ns": RepeatedMessages(start, received.stamp_ns[received.frame_ix[entry_rows]]),
+            "range_m": RepeatedMessages(start, None if view is None else view.range_m[entry_rows]),
+            "visible_share": RepeatedMessages(start, None if view is None else view.visible_share[entry_rows]),
         }
 
     def _besides(self, frame: int) -> bytes:

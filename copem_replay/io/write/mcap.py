@@ -64,7 +64,7 @@ CHUNK_BYTES = 1 << 20
 CHUNKS_AHEAD = 16
 """Chunks that may be encoded before they are written: lists are encoded many at once, so that some take long."""
 _EVENT_TIMES = ("onset_s", "captured_s", "time_to_detection_s", "distance_at_detection_m")
-"""Columns of the detections table that the event of a detection tells of."""
+"""Columns of the detections table that are copied into each detection event."""
 ROSBAG_RECORD, ROSBAG_COUNTS = "rosbag2", "serialized_metadata"
 """rosbag2's metadata record, and its key that counts messages: wrong in a copy with more of them."""
 RunLists = tuple[Mapping[str, FusedTracks], Sequence[ReadyLists]]
@@ -99,8 +99,8 @@ def write_mcap(
     written; RecordingError: `source` can no longer be read.
     """
     original = open_source(source, window)
-    rest = iter(run_chunks)
-    first, of_units = next(rest)  # names the configurations and the units
+    later_chunks = iter(run_chunks)
+    first, of_units = next(later_chunks)  # names the configurations and the units
     units = [unit for fused_tracks in first.values() for unit in fused_tracks.received.units]
     units += [unit.name for unit in of_units]
     numbers = {unit: k for k, unit in enumerate(dict.fromkeys(units), start=1)}
@@ -109,13 +109,13 @@ def write_mcap(
         catalogue = Catalogue(writer)
         ours = {topic for name in first for topic in (*list_topics(name), *list_extra_topics(name))} | {*TRUTH_TOPICS}
         ours |= {topic for unit in of_units for topic in list_unit_topics(unit.name)}
-        messages = original.messages(original.register(catalogue, without=ours))
+        messages = original.messages(original.register(catalogue, left_out=ours))
         opened = (family or OSI)(catalogue, scene, numbers)
         encode = partial(_encode_chunk, opened, scene, tables, colours)
         begun = list(encode((first, of_units)))  # registers the channels, those of the lists first
         shown = [] if truth is None or TRUTH in first else [_encode_truth(opened.truth(), truth)]
         del first, of_units
-        chunks = chain([begun], map(list, map(encode, rest)))
+        chunks = chain([begun], map(list, map(encode, later_chunks)))
         added, later_ns = _shift_to_zero(_merge_by_time([chain.from_iterable(map(_order_by_time, chunks)), *shown]))
         _add_records(writer, original, opened.osi, {**manifest, **{f"unit.{k}": unit for unit, k in numbers.items()}})
         for encoded in _encode_ahead(_merge_by_time([messages, added])):
@@ -183,12 +183,12 @@ def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
     frame, encode = 0, writer.encode_transforms
     for part in truth.moving:
         poses = truth.followed[frame : frame + len(part.time_ns)]
-        there = np.array([pose is not None for pose in poses], dtype=bool)
+        posed = np.array([pose is not None for pose in poses], dtype=bool)
         content = transform_content(
-            writer.frame_id, truth.follow, [pose for pose in poses if pose is not None], part.time_ns[there]
+            writer.frame_id, truth.follow, [pose for pose in poses if pose is not None], part.time_ns[posed]
         )
-        moves = iter(encode(content, int(there.sum())))
-        for time_ns, drawn, followed in zip(part.time_ns.tolist(), draw_moving(part, writer.draw), there, strict=True):
+        moves = iter(encode(content, int(posed.sum())))
+        for time_ns, drawn, followed in zip(part.time_ns.tolist(), draw_moving(part, writer.draw), posed, strict=True):
             if frame == 0:
                 (static,) = draw_moving(MovingEntities.at(time_ns, truth.static), writer.draw)
                 yield Message(writer.static, time_ns, static, time_ns, 0)
@@ -278,11 +278,11 @@ def _keep_metadata(original: RecordingSource) -> dict[str, dict[str, str]]:
 def _osi_record(original: RecordingSource, osi_version: str, protobuf: str) -> dict[str, str]:
     """The input's OSI record, its ranges of versions widened to those written here; a new one where it had none."""
     record = dict(original.metadata.get(OSI_RECORD, {}))
-    for what, ours in (("osi", osi_version), ("protobuf", protobuf)):
-        key = f"{OSI_CHANNEL}{what}_version"
+    for package, ours in (("osi", osi_version), ("protobuf", protobuf)):
+        key = f"{OSI_CHANNEL}{package}_version"
         seen = [ours, *(c.metadata[key] for c in original.channels.values() if key in c.metadata)]
         for end, pick in (("min", min), ("max", max)):
-            name = f"{end}_{what}_version"
+            name = f"{end}_{package}_version"
             record[name] = pick([*seen, *([record[name]] if record.get(name) else [])], key=_parse_release)
     record["version"] = record.get("version") or osi_version
     return dict(sorted(record.items()))
@@ -310,16 +310,16 @@ class BatchWriter(Writer):
 
     def add_messages(self, messages: Iterable[Message]) -> None:
         """Add messages as `add_message` does one by one."""
-        whole: list[Message] = []
+        batch: list[Message] = []
         offset, most = self._chunk.count, vars(self)["_Writer__chunk_size"]
         for message in messages:
-            whole.append(message)
+            batch.append(message)
             offset += _MESSAGE_HEAD.size + len(message.data)
             if offset > most:
-                self._fill_chunk(whole)
-                whole, offset = [], 0
-        if whole:
-            self._fill_chunk(whole)
+                self._fill_chunk(batch)
+                batch, offset = [], 0
+        if batch:
+            self._fill_chunk(batch)
 
     @property
     def _chunk(self) -> ChunkBuilder:

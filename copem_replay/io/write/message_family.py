@@ -195,12 +195,12 @@ class _OsiFamily(OpenedFamily):
             name, content = (DETAIL_SCHEMA, DETAIL_JSON) if kind == "detail" else (STATUS_SCHEMA, STATUS_JSON)
             return "json", self._catalogue.schema(name, "jsonschema", json.dumps(content).encode()), {}
         schema = _load_class(kind).DESCRIPTOR.full_name, "protobuf", _describe_class(_load_class(kind))
-        about = {
+        metadata = {
             f"{OSI_CHANNEL}description": described,
             f"{OSI_CHANNEL}osi_version": OSI_VERSION,
             f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
         }
-        return "protobuf", self._catalogue.schema(*schema), about if kind in _OSI_LISTS else {}
+        return "protobuf", self._catalogue.schema(*schema), metadata if kind in _OSI_LISTS else {}
 
     def _encoder(self, kind: str) -> Encode:
         return partial(encode_messages, _load_class(kind).DESCRIPTOR)

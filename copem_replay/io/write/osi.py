@@ -87,14 +87,14 @@ def add_road(osi: GroundTruth, lines: Iterable[Float], site: SiteMap) -> None:
             for x, y, z in line.tolist():
                 boundary.boundary_line.add(position={"x": x, "y": y, "z": z})
     for lane, ident in zip(site.lanes, _number_ids([lane.id for lane in site.lanes]), strict=True):
-        of = osi.lane.add(id={"value": ident}).classification
-        of.type = lane_types.TYPE_DRIVING if lane.kind == "driving" else lane_types.TYPE_NONDRIVING
-        of.subtype, of.centerline_is_driving_direction = SUBTYPES[lane.kind], True
+        classification = osi.lane.add(id={"value": ident}).classification
+        classification.type = lane_types.TYPE_DRIVING if lane.kind == "driving" else lane_types.TYPE_NONDRIVING
+        classification.subtype, classification.centerline_is_driving_direction = SUBTYPES[lane.kind], True
         left, right = lane.across()
         for x, y, z in ((left + right) / 2).tolist():
-            of.centerline.add(x=x, y=y, z=z)
-        of.left_lane_boundary_id.add(value=numbers[lane.left_m.tobytes()])
-        of.right_lane_boundary_id.add(value=numbers[lane.right_m.tobytes()])
+            classification.centerline.add(x=x, y=y, z=z)
+        classification.left_lane_boundary_id.add(value=numbers[lane.left_m.tobytes()])
+        classification.right_lane_boundary_id.add(value=numbers[lane.right_m.tobytes()])
     outlines = list(outline_crosswalks(site.areas, site.lanes))
     names = [area.name.split()[-1] for area in site.areas if area.kind == "crosswalk"]
     for ring, ident in zip(outlines, _number_ids(names), strict=True):
@@ -124,14 +124,14 @@ def write_osi_trace(trace: OsiTrace, path: Path) -> None:
 
 def _write_content(writer: Writer, trace: OsiTrace) -> None:
     osi_version = osi3.__version__
-    about = {
+    trace_metadata = {
         **dict.fromkeys(("version", "min_osi_version", "max_osi_version"), osi_version),
         **dict.fromkeys(("min_protobuf_version", "max_protobuf_version"), protobuf_version),
         "description": trace.description,
         "authors": "copem_replay",
         "data_sources": trace.source,
     }  # neither creation_time nor zero_time: the first would be a clock, and the scene has no date
-    writer.add_metadata(_TRACE, dict(sorted(about.items())))
+    writer.add_metadata(_TRACE, dict(sorted(trace_metadata.items())))
     prefix = f"{_TRACE}.channel."
     versions = {f"{prefix}osi_version": osi_version, f"{prefix}protobuf_version": protobuf_version}
     schema_ids: dict[str, int] = {}
@@ -226,7 +226,7 @@ class SensorDataWriter:
             getattr(fused, name)[0, rows]
             for name in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad", "vx_mps", "vy_mps")
         )
-        around, fast = _standard_deviation(fused.size_var_m2, rows), _standard_deviation(fused.speed_var_m2ps2, rows)
+        size_sd, v_sd = _standard_deviation(fused.size_var_m2, rows), _standard_deviation(fused.speed_var_m2ps2, rows)
         return {
             "header": self._header(rows, captured_ns),
             "base": {
@@ -241,8 +241,8 @@ class SensorDataWriter:
                     "y": _standard_deviation(fused.cov_nn_m2, rows),
                 },
                 "orientation": {"yaw": _standard_deviation(fused.yaw_var_rad2, rows)},
-                "dimension": dict.fromkeys(("length", "width", "height"), around),
-                **({"velocity": {"x": fast, "y": fast}} if moving else {}),
+                "dimension": dict.fromkeys(("length", "width", "height"), size_sd),
+                **({"velocity": {"x": v_sd, "y": v_sd}} if moving else {}),
             },
             **({"candidate": self._candidates(rows)} if moving else {}),
         }
@@ -251,16 +251,16 @@ class SensorDataWriter:
         claims, object_ix = self._fused_tracks.said, self._fused_tracks.fused.row_object_ix[rows]
         true_id = self._ids[object_ix[object_ix >= 0]]
         track_id = None if claims is None else claims["track_id"][rows]
-        start, used = expand_ranges(self._used_start, rows)
-        fresh = start_offsets(self._captured_ns[used] == np.repeat(captured_ns, np.diff(start)))
+        start, entry_rows = expand_ranges(self._used_start, rows)
+        new_entries = start_offsets(self._captured_ns[entry_rows] == np.repeat(captured_ns, np.diff(start)))
         return {
             "tracking_id": {"value": true_id}
             if track_id is None
             else optional_message(track_id >= 0, {"value": track_id[track_id >= 0]}),
             "ground_truth_id": optional_message(object_ix >= 0, {"value": true_id}),
             "existence_probability": 1.0 if claims is None else claims["existence"][rows],
-            "measurement_state": np.where(np.diff(fresh[start]) > 0, _MEASURED, _STALE),
-            "sensor_id": RepeatedMessages(start, {"value": self._unit[used]}),
+            "measurement_state": np.where(np.diff(new_entries[start]) > 0, _MEASURED, _STALE),
+            "sensor_id": RepeatedMessages(start, {"value": self._unit[entry_rows]}),
         }
 
     def _candidates(self, rows: Int) -> RepeatedMessages:

@@ -79,10 +79,10 @@ class RecordingSource:
 
     def __init__(self, log: Log) -> None:
         self._log, records = log.attempt(_read_through)
-        whole = self._log
-        damaged = whole is not log or not whole.complete
+        opened = self._log
+        damaged = opened is not log or not opened.complete
         self.damage = "damaged: its messages are copied as far as they can be read" if damaged else None
-        recordings = [part.log for part in whole.parts] if isinstance(whole, JoinedLog) else [whole]
+        recordings = [part.log for part in opened.parts] if isinstance(opened, JoinedLog) else [opened]
         profiles = {_find_profile(records[next(_list_files(recording)).path]) for recording in recordings}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -90,17 +90,17 @@ class RecordingSource:
             if isinstance(record, Metadata):  # merged with others of its name: rosbag2 writes one name several times
                 self.metadata.setdefault(record.name, {}).update(record.metadata)
         self._attachments = [a for of_file in records.values() for a in of_file if isinstance(a, Attachment)]
-        self._topics = {channel.number: channel.topic for channel in whole.channels}
-        self.channels = dict(_list_channels(whole))
+        self._topics = {channel.number: channel.topic for channel in opened.channels}
+        self.channels = dict(_list_channels(opened))
 
-    def register(self, catalogue: Catalogue, without: Collection[str] = ()) -> dict[int, int]:
-        """Put schemas, channels and attachments into the output, except the topics `without`.
+    def register(self, catalogue: Catalogue, left_out: Collection[str] = ()) -> dict[int, int]:
+        """Put schemas, channels and attachments into the output, except the topics `left_out`.
 
         Returns the new number of each channel by its number here.
         """
         numbers: dict[int, int] = {}
         for number, c in self.channels.items():
-            if c.topic not in without:
+            if c.topic not in left_out:
                 named = c.schema or c.schema_encoding or c.schema_data
                 schema = catalogue.schema(c.schema, c.schema_encoding, c.schema_data) if named else 0
                 numbers[number] = catalogue.channel(self._topics[number], c.encoding, schema, dict(c.metadata))
@@ -179,10 +179,10 @@ def _describe_trace(log: TraceLog, channel: Channel) -> Channel:
     """The channel of a trace, with the definition and the metadata that OSI has for channels."""
     from mcap_protobuf.schema import build_file_descriptor_set
 
-    about = {
+    metadata = {
         f"{OSI_CHANNEL}description": f"the trace {log.path.name}",
         f"{OSI_CHANNEL}osi_version": log.osi_version or OSI_VERSION,
         f"{OSI_CHANNEL}protobuf_version": version("protobuf"),
     }
     definition = build_file_descriptor_set(load_message_class(channel.schema)).SerializeToString(deterministic=True)
-    return replace(channel, schema_encoding="protobuf", schema_data=definition, metadata=about)
+    return replace(channel, schema_encoding="protobuf", schema_data=definition, metadata=metadata)

@@ -67,16 +67,16 @@ class Aggregator:
             episode_of, first, count, np.cumsum(count) - count, episodes.onset_s, episodes.ended_s
         )
         self._issue_s, self._reference, self._settings = issue_s, reference, settings
-        self._parameters = asked = make_parameters(settings, measured_class)
+        self._parameters = params = make_parameters(settings, measured_class)
         S, M, L = runs, len(episodes.object_ix), int(count.sum())
         self._out = AccuracySums(
             np.full((S, L), np.nan, dtype=np.float32),
             np.full((S, L), np.nan, dtype=np.float32),
             np.zeros((S, M), dtype=OBJECT),
             np.zeros(S, dtype=RUN),
-            np.zeros((S, len(asked.existence_thresholds)), dtype=np.int64),
-            np.zeros((S, max(len(asked.distance_edges_m) - 1, 0)), dtype=BAND),
-            np.zeros((S, max(len(asked.time_edges_s) - 1, 0)), dtype=BAND),
+            np.zeros((S, len(params.existence_thresholds)), dtype=np.int64),
+            np.zeros((S, max(len(params.distance_edges_m) - 1, 0)), dtype=BAND),
+            np.zeros((S, max(len(params.time_edges_s) - 1, 0)), dtype=BAND),
             np.zeros((S, EXISTENCE_BINS), dtype=EXISTENCE),
         )
         self._out.by_run["lists"] = reference.present.sum()
@@ -85,10 +85,10 @@ class Aggregator:
         self._states = EpisodeStates(np.full((S, M), -1), np.tile(episodes.onset_s, (S, 1)))
         self._added = 0
 
-    def add(self, lists: ObjectLists, about: Matches, now: Matches, world: Tracks) -> None:
+    def add(self, lists: ObjectLists, matches: Matches, now: Matches, world: Tracks) -> None:
         """Add the next lists.
 
-        `about`: matches at the instants the entries tell of; `now`: at the instants the lists are available. `world`:
+        `matches`: matches at the instants the entries tell of; `now`: at the instants the lists are available. `world`:
         the truth when lists are available, frame k for the k-th list. Raises ValueError for another number of runs, or
         more lists than are left.
         """
@@ -100,7 +100,7 @@ class Aggregator:
         chunk = slice(self._added, self._added + count)
         reference = self._reference
         add_up(
-            lists.start, lists.entries, take_match_columns(about), take_match_columns(now), self._issue_s[chunk],
+            lists.start, lists.entries, take_match_columns(matches), take_match_columns(now), self._issue_s[chunk],
             sort_truth_by_list(world),
             self._stays._replace(first_list=self._stays.first_list - self._added),
             reference.x_m[chunk], reference.y_m[chunk], reference.present[chunk],
@@ -117,7 +117,7 @@ class Aggregator:
 
 
 def make_parameters(settings: AccuracySettings, measured_class: Bool) -> AccuracyParameters:
-    """The settings as compiled code takes them. `measured_class (C,)`: as of `Aggregator`."""
+    """The settings as arrays and numbers for compiled code. `measured_class (C,)`: as of `Aggregator`."""
     return AccuracyParameters(
         settings.cutoff_m, settings.power, settings.gate_m, measured_class, _as_column(settings.distance_edges_m),
         _as_column(settings.time_edges_s), _as_column(settings.existence_thresholds),
@@ -130,12 +130,12 @@ def _as_column(values: tuple[float, ...]) -> Float:
 
 
 def take_match_columns(matches: Matches) -> EntryMatches:
-    """The matches as compiled code takes them."""
+    """The columns of the matches as arrays for compiled code."""
     return EntryMatches(matches.object_ix, matches.role, matches.x_m, matches.y_m, matches.class_ix)
 
 
 def sort_truth_by_list(truth: Tracks) -> TruthByList:
-    """The truth frame by frame, in each by object."""
+    """The rows of the truth sorted by list, and by object within a list."""
     order = np.lexsort((truth.row_object_ix, truth.frame_ix))
     columns = (getattr(truth, name)[0, order] for name in ("x_m", "y_m", "vx_mps", "vy_mps"))
     return TruthByList(truth.by_frame[1], truth.row_object_ix[order], *columns)
@@ -152,7 +152,7 @@ def _time_s(issue_s: Float, present: Bool) -> float:
 
 
 def are_annotated(x_m: Float, y_m: Float, list_ix: Int, reference: Reference, settings: AccuracySettings) -> Bool:
-    """(N,) whether places in lists are in the annotated area; `reference`: at the instants of all lists."""
+    """(N,) whether listed places are in the annotated area; `reference`: the place at the instants of all lists."""
     if not settings.annotated_m and np.isinf(settings.annotated_range_m):
         return np.ones(len(list_ix), dtype=bool)
     from_m, corners = (reference.x_m[list_ix], reference.y_m[list_ix]), polygon_corners(settings.annotated_m)

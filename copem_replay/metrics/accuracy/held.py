@@ -58,7 +58,7 @@ _FRAMES_AT_ONCE = 600
 
 @dataclass(frozen=True)
 class HeldFrames:
-    """The frames of a log at which configurations are compared, and what is there: the same for all of them."""
+    """The frames of a log at which configurations are compared, with truth and reference at each."""
 
     time_s: Float  # (G,)
     truth: TruthByList  # by frame, objects with an episode only
@@ -68,13 +68,13 @@ class HeldFrames:
 
 
 def make_held_frames(
-    frame_s: Float, episodes: Episodes, at: Callable[[Float], Tracks], reference: Callable[[Float], Reference]
+    frame_s: Float, episodes: Episodes, truth_at: Callable[[Float], Tracks], reference: Callable[[Float], Reference]
 ) -> HeldFrames:
-    """The frames of a log. `frame_s`: those of its truth, ascending; `at`, `reference`: truth and place at instants."""
+    """The frames of a log. `frame_s`: of its truth, ascending; `truth_at`, `reference`: truth and place at instants."""
     time_s = thin_frames(frame_s)
     parts = []
     for k in range(0, max(len(time_s), 1), _FRAMES_AT_ONCE):
-        world = at(time_s[k : k + _FRAMES_AT_ONCE])
+        world = truth_at(time_s[k : k + _FRAMES_AT_ONCE])
         parts.append(sort_truth_by_list(world.take_tracks(np.isin(world.object_ix, episodes.object_ix))))
     rows = np.concatenate([np.zeros(1, dtype=np.int64), *(np.diff(part.start) for part in parts)])
     columns = (np.concatenate(of) for of in zip(*(part[1:] for part in parts), strict=True))
@@ -90,12 +90,12 @@ def thin_frames(frame_s: Float) -> Float:
 
     A frame that is late by up to half of the time between two does not put off the next.
     """
-    kept, due_s = [], float(frame_s[0]) if len(frame_s) else 0.0
+    thinned_s, due_s = [], float(frame_s[0]) if len(frame_s) else 0.0
     for time_s in frame_s.tolist():
         if time_s >= due_s - _EARLY_S:
-            kept.append(time_s)
+            thinned_s.append(time_s)
             due_s = max(due_s, time_s - EVERY_S / 2) + EVERY_S
-    return np.array(kept, dtype=np.float64)
+    return np.array(thinned_s, dtype=np.float64)
 
 
 def find_newest_lists(issue_s: Float, frame_s: Float, max_age_s: float) -> tuple[Int, Bool]:
@@ -122,7 +122,7 @@ class HeldAccuracy:
     without_truth: Int  # (S,) held entries whose object has no truth at the frame
 
     def repeated(self, runs: int) -> HeldAccuracy:
-        """Of `runs` runs, each as the one run that stands for all."""
+        """The accuracy of `runs` equal runs, from that of one."""
         if len(self.without_truth) == runs:
             return self
         error_m, age_s, gospa = (
@@ -161,17 +161,17 @@ class HeldErrors:
         self._out = _HeldColumns(error_m, age_s, gospa, np.zeros(runs, dtype=np.int64))
         self._added = self._measured = 0
 
-    def add(self, lists: ObjectLists, about: Matches) -> None:
-        """Add the next lists. `about`: matches at the instants the entries tell of."""
+    def add(self, lists: ObjectLists, matches: Matches) -> None:
+        """Add the next lists. `matches`: matches at the instants the entries tell of."""
         frames, (newest, is_held) = self._frames, self._newest
         after = self._added + lists.start.shape[1] - 1
         chunk = slice(self._measured, int(np.searchsorted(newest, after, side="left")))
         number = np.where(is_held, newest - self._added, -1)[chunk]
         reference, M = frames.reference, len(self._episodes.first)
         _measure_frames(
-            lists.start, lists.entries, take_match_columns(about), number, self._measured, frames.time_s, frames.truth,
-            self._episodes, (reference.x_m, reference.y_m, reference.present), self._parameters, self._out,
-            make_targets(M), make_estimates(lists), _FrameScratch(np.full(M, -1), np.zeros(M, dtype=bool)),
+            lists.start, lists.entries, take_match_columns(matches), number, self._measured, frames.time_s,
+            frames.truth, self._episodes, (reference.x_m, reference.y_m, reference.present), self._parameters,
+            self._out, make_targets(M), make_estimates(lists), _FrameScratch(np.full(M, -1), np.zeros(M, dtype=bool)),
         )  # fmt: skip
         self._added, self._measured = after, chunk.stop
 
@@ -209,83 +209,88 @@ class _FrameScratch(NamedTuple):
 
 @borrowing_kernel
 def _measure_frames(
-    start: Int, entries: Entries, about: EntryMatches, number: Int, first: int, time_s: Float, truth: TruthByList,
-    episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], asked: AccuracyParameters, out: _HeldColumns,
-    targets: Targets, estimates: Estimates, here: _FrameScratch,
+    start: Int, entries: Entries, matches: EntryMatches, number: Int, first: int, time_s: Float, truth: TruthByList,
+    episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], params: AccuracyParameters, out: _HeldColumns,
+    targets: Targets, estimates: Estimates, room: _FrameScratch,
 ) -> None:  # fmt: skip
-    # Frames `first`, `first + 1`, …, at which the lists `number` are held, −1: none.
+    # Adds the errors at frames `first`, `first + 1`, … to `out`; `number`: the list held at each, −1: none.
     reference_x_m, reference_y_m, is_placed = reference
     for q in range(len(number)):
         g, k = first + q, number[q]
         if not is_placed[g]:
             continue
-        wanted = _gather_present(g, truth, episodes, targets, here)
+        n_true = _gather_present(g, truth, episodes, targets, room)
         for s in range(len(start)):
             count = 0
             if k >= 0:
                 count = _add_held_entries(
-                    s, start[s, k], start[s, k + 1], entries, about, time_s[g], episodes,
-                    (reference_x_m[g], reference_y_m[g]), asked, targets, estimates, here, out,
+                    s, start[s, k], start[s, k + 1], entries, matches, time_s[g], episodes,
+                    (reference_x_m[g], reference_y_m[g]), params, targets, estimates, room, out,
                 )  # fmt: skip
-            _fill_gospa(targets, wanted, estimates, count, asked, out.gospa[s])
+            _fill_gospa(targets, n_true, estimates, count, params, out.gospa[s])
         for p in range(truth.start[g], truth.start[g + 1]):
             m = episodes.episode_of[truth.object_ix[p]]
-            here.target_of[m], here.present[m] = -1, False
+            room.target_of[m], room.present[m] = -1, False
 
 
 @borrowing
 def _fill_gospa(
-    targets: Targets, wanted: int, estimates: Estimates, count: int, asked: AccuracyParameters, out: NDArray[np.float32]
+    targets: Targets,
+    n_true: int,
+    estimates: Estimates,
+    count: int,
+    params: AccuracyParameters,
+    out: NDArray[np.float32],
 ) -> None:
     # Out: GOSPAᵖ of each target.
-    if wanted > 0:
-        divide_gospa(targets, wanted, estimates, count, asked.cutoff_m, asked.power)
-        for t in range(wanted):
+    if n_true > 0:
+        divide_gospa(targets, n_true, estimates, count, params.cutoff_m, params.power)
+        for t in range(n_true):
             out[targets.column[t]] = targets.located[t] + targets.missed[t] + targets.false[t]
 
 
 @borrowing
-def _gather_present(g: int, truth: TruthByList, episodes: _EpisodeFrames, targets: Targets, here: _FrameScratch) -> int:
+def _gather_present(g: int, truth: TruthByList, episodes: _EpisodeFrames, targets: Targets, room: _FrameScratch) -> int:
     # Out: the objects that count at frame g, and those that the truth has there. Returns the number of the first.
-    wanted = 0
+    n_true = 0
     for p in range(truth.start[g], truth.start[g + 1]):
         m = episodes.episode_of[truth.object_ix[p]]
-        here.present[m] = True
+        room.present[m] = True
         if g < episodes.first[m] or g >= episodes.first[m] + episodes.frames[m]:
             continue
-        here.target_of[m] = wanted
-        targets.episode[wanted], targets.column[wanted] = m, episodes.column[m] + g - episodes.first[m]
-        targets.x_m[wanted], targets.y_m[wanted] = truth.x_m[p], truth.y_m[p]
-        wanted += 1
-    return wanted
+        room.target_of[m] = n_true
+        targets.episode[n_true], targets.column[n_true] = m, episodes.column[m] + g - episodes.first[m]
+        targets.x_m[n_true], targets.y_m[n_true] = truth.x_m[p], truth.y_m[p]
+        n_true += 1
+    return n_true
 
 
 @borrowing
 def _add_held_entries(
-    s: int, first: int, after: int, entries: Entries, about: EntryMatches, time_s: float, episodes: _EpisodeFrames,
-    from_m: tuple[float, float], asked: AccuracyParameters, targets: Targets, estimates: Estimates,
-    here: _FrameScratch, out: _HeldColumns,
+    s: int, first: int, after: int, entries: Entries, matches: EntryMatches, time_s: float, episodes: _EpisodeFrames,
+    from_m: tuple[float, float], params: AccuracyParameters, targets: Targets, estimates: Estimates,
+    room: _FrameScratch, out: _HeldColumns,
 ) -> int:  # fmt: skip
     # Errors and ages of the entries of a list that is held in run s. Returns the number of entries in GOSPA.
     count = 0
     for i in range(first, after):
-        if about.role[i] == GHOST:
-            false = asked.measured_class[about.class_ix[i]]
+        if matches.role[i] == GHOST:
+            false = params.measured_class[matches.class_ix[i]]
         else:
-            m = episodes.episode_of[about.object_ix[i]]
-            target = here.target_of[m] if m >= 0 else -1
-            false = m >= 0 and not here.present[m] and time_s >= episodes.onset_s[m] - SAME_INSTANT_S
+            m = episodes.episode_of[matches.object_ix[i]]
+            target = room.target_of[m] if m >= 0 else -1
+            false = m >= 0 and not room.present[m] and time_s >= episodes.onset_s[m] - SAME_INSTANT_S
             if false:
                 out.without_truth[s] += 1
             elif target < 0:
                 continue
-            elif about.role[i] == MATCH:
+            elif matches.role[i] == MATCH:
                 column = targets.column[target]
                 east_m, north_m = entries[i].x_m - targets.x_m[target], entries[i].y_m - targets.y_m[target]
                 out.error_m[s, column], out.age_s[s, column] = np.hypot(east_m, north_m), time_s - entries[i].captured_s
-        if false or about.role[i] != GHOST:
+        if false or matches.role[i] != GHOST:
             if false and not is_in_area(
-                entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], asked.annotated_m, asked.annotated_range_m
+                entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], params.annotated_m, params.annotated_range_m
             ):
                 continue
             estimates.x_m[count], estimates.y_m[count] = entries[i].x_m, entries[i].y_m

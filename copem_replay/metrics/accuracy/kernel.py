@@ -89,7 +89,7 @@ Records = NDArray[Any]
 
 
 class TruthByList(NamedTuple):
-    """The truth list by list, in each by object: list k has rows `start[k] : start[k + 1]`."""
+    """The truth sorted by list, then by object: list k has rows `start[k] : start[k + 1]`."""
 
     start: Int  # (K + 1,)
     object_ix: Int  # (P,), as all that follow
@@ -135,7 +135,7 @@ class AccuracyParameters(NamedTuple):
 
 
 class AccuracySums(NamedTuple):
-    """Where the sums go: fields and shapes are those of `Accuracy`."""
+    """The arrays that sums are added to: fields and shapes are those of `Accuracy`."""
 
     error_m: NDArray[np.float32]
     gospa: NDArray[np.float32]
@@ -148,14 +148,14 @@ class AccuracySums(NamedTuple):
 
 
 class EpisodeStates(NamedTuple):
-    """What is carried from list to list. All (S, M)."""
+    """The state of each episode that carries over from list to list. All (S, M)."""
 
     last_track: Int  # the track of the object's last pair, −1: none
     unknown_since_s: Float  # NaN: known
 
 
 class ListScratch(NamedTuple):
-    """The objects whose stay includes the list at hand, and their matches in the run at hand."""
+    """Scratch for one list: the objects whose stay includes it, and their matches in the current run."""
 
     episode: Int
     row: Int  # of the truth, −1: it has a gap there
@@ -167,7 +167,7 @@ class ListScratch(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """The objects that are looked at now: the truth of GOSPA; and its division among them."""
+    """The true objects of the current list that GOSPA counts, and what the division of GOSPA among them gives."""
 
     episode: Int
     column: Int  # of this list in the arrays list by list
@@ -180,7 +180,7 @@ class Targets(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The entries of the list at hand that GOSPA counts."""
+    """The entries of the current list that GOSPA counts."""
 
     x_m: Float
     y_m: Float
@@ -188,33 +188,33 @@ class Estimates(NamedTuple):
 
 
 def make_targets(most: int) -> Targets:
-    """Room for so many objects."""
+    """Targets with room for `most` objects."""
     whole, real = np.empty((3, most), dtype=np.int64), np.empty((5, most))
     return Targets(whole[0], whole[1], real[0], real[1], whole[2], real[2], real[3], real[4])
 
 
 def make_estimates(lists: ObjectLists) -> Estimates:
-    """Room for the entries of any of the lists."""
+    """Estimates with room for the entries of the longest list."""
     x_m, y_m = np.empty((2, lists.longest))
     return Estimates(x_m, y_m, np.empty(lists.longest, dtype=bool))
 
 
 def make_list_scratch(most: int) -> ListScratch:
-    """Room for so many objects."""
+    """Scratch with room for `most` objects."""
     episode, row, distance_band, pair, match, target = np.empty((6, most), dtype=np.int64)
     return ListScratch(episode, row, distance_band, pair, match, target, np.full(most, -1))
 
 
 @borrowing_kernel
 def add_up(
-    start: Int, entries: Entries, about: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
-    stays: EpisodeLists, reference_x_m: Float, reference_y_m: Float, present: Bool, asked: AccuracyParameters,
-    so_far: EpisodeStates, out: AccuracySums, here: ListScratch, targets: Targets, estimates: Estimates,
+    start: Int, entries: Entries, matches: EntryMatches, now: EntryMatches, issue_s: Float, world: TruthByList,
+    episodes: EpisodeLists, reference_x_m: Float, reference_y_m: Float, present: Bool, params: AccuracyParameters,
+    so_far: EpisodeStates, out: AccuracySums, room: ListScratch, targets: Targets, estimates: Estimates,
 ) -> None:  # fmt: skip
-    """Add the next K lists of S runs to `out`. Numbers of lists in `stays` count from the first of them.
+    """Add the next K lists of S runs to `out`. Numbers of lists in `episodes` count from the first of them.
 
-    `about`: matches at the instants the entries tell of; `now`: at those the lists are available. The last three: room
-    for what is known of the list at hand.
+    `matches`: at the instants the entries tell of; `now`: at those the lists are available. `room`, `targets` and
+    `estimates`: scratch for one list.
     """
     S = len(out.by_object)
     # The expected moments are kept while the covariance stays the same, which it mostly does from list to list.
@@ -224,34 +224,34 @@ def add_up(
         if not present[k]:
             continue
         from_m = (reference_x_m[k], reference_y_m[k])
-        n, wanted = _gather_targets(k, issue_s[k], world, stays, from_m, asked, here, targets)
-        time_band = _find_band(asked.time_edges_s, issue_s[k])
+        n, n_true = _gather_targets(k, issue_s[k], world, episodes, from_m, params, room, targets)
+        time_band = _find_band(params.time_edges_s, issue_s[k])
         for s in range(S):
-            here.pair[:n] = -1
-            here.match[:n] = -1
+            room.pair[:n] = -1
+            room.match[:n] = -1
             count = _add_entries(
-                s, start[s, k], start[s, k + 1], entries, about, now, stays, from_m, time_band, asked,
-                here, targets, wanted, estimates, out,
+                s, start[s, k], start[s, k + 1], entries, matches, now, episodes, from_m, time_band, params,
+                room, targets, n_true, estimates, out,
             )  # fmt: skip
             for h in range(n):
-                m, match = here.episode[h], here.match[h]
-                if here.target[h] >= 0:
+                m, match = room.episode[h], room.match[h]
+                if room.target[h] >= 0:
                     _count_look(out.by_object[s], m, match)
-                    _count_look(out.by_distance[s], here.distance_band[h], match)
+                    _count_look(out.by_distance[s], room.distance_band[h], match)
                     _count_look(out.by_time[s], time_band, match)
-                if here.row[h] >= 0:
-                    _update_gap(out.by_object[s, m], m, match, issue_s[k], stays, so_far.unknown_since_s[s])
-                i, p = here.pair[h], here.row[h]
+                if room.row[h] >= 0:
+                    _update_gap(out.by_object[s, m], m, match, issue_s[k], episodes, so_far.unknown_since_s[s])
+                i, p = room.pair[h], room.row[h]
                 if i < 0:
                     continue
                 entry, sums = entries[i], out.by_object[s, m]
-                then_east_m, then_north_m = entry.x_m - about.x_m[i], entry.y_m - about.y_m[i]
+                then_east_m, then_north_m = entry.x_m - matches.x_m[i], entry.y_m - matches.y_m[i]
                 nees, large, small = compute_nees(
                     entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2, then_east_m, then_north_m
                 )
                 if large != large_m2 or small != small_m2:
                     large_m2, small_m2 = large, small
-                    beyond, nees_expected, nees_square_expected = expect_gated_nees(large, small, asked.gate_m)
+                    beyond, nees_expected, nees_square_expected = expect_gated_nees(large, small, params.gate_m)
                 square_m2, age_of_information_s = then_east_m**2 + then_north_m**2, issue_s[k] - entry.captured_s
                 _add_object_sums(
                     sums, entry, square_m2, beyond, nees_square_expected, age_of_information_s, m, so_far.last_track[s]
@@ -259,89 +259,89 @@ def add_up(
                 east_m = north_m = np.nan
                 if p >= 0:
                     east_m, north_m = entry.x_m - world.x_m[p], entry.y_m - world.y_m[p]
-                    out.error_m[s, stays.column[m] + k - stays.first_list[m]] = np.hypot(east_m, north_m)
+                    out.error_m[s, episodes.column[m] + k - episodes.first_list[m]] = np.hypot(east_m, north_m)
                     vx_mps, vy_mps = entry.vx_mps - world.vx_mps[p], entry.vy_mps - world.vy_mps[p]
                     sums.velocity_square_m2ps2 += vx_mps**2 + vy_mps**2
                 _add_pair(out.by_object[s], m, east_m, north_m, nees, nees_expected)
-                _add_pair(out.by_distance[s], here.distance_band[h], east_m, north_m, nees, nees_expected)
+                _add_pair(out.by_distance[s], room.distance_band[h], east_m, north_m, nees, nees_expected)
                 _add_pair(out.by_time[s], time_band, east_m, north_m, nees, nees_expected)
-            _add_gospa(out.gospa[s], out.by_object[s], out.by_run[s], targets, wanted, estimates, count, asked)
+            _add_gospa(out.gospa[s], out.by_object[s], out.by_run[s], targets, n_true, estimates, count, params)
         for h in range(n):
-            here.place_of[here.episode[h]] = -1
+            room.place_of[room.episode[h]] = -1
 
 
 @borrowing_kernel
-def close_episodes(stays: EpisodeLists, so_far: EpisodeStates, out: AccuracySums) -> None:
+def close_episodes(episodes: EpisodeLists, so_far: EpisodeStates, out: AccuracySums) -> None:
     """Add the gaps that last until the episodes end, after all lists."""
     S, M = out.by_object.shape
     for s in range(S):
         for m in range(M):
             if not np.isnan(so_far.unknown_since_s[s, m]):
                 sums = out.by_object[s, m]
-                sums.longest_gap_s = max(sums.longest_gap_s, stays.ended_s[m] - so_far.unknown_since_s[s, m])
+                sums.longest_gap_s = max(sums.longest_gap_s, episodes.ended_s[m] - so_far.unknown_since_s[s, m])
 
 
 @borrowing
 def _gather_targets(
-    k: int, issue_s: float, world: TruthByList, stays: EpisodeLists, from_m: tuple[float, float],
-    asked: AccuracyParameters, here: ListScratch, targets: Targets,
+    k: int, issue_s: float, world: TruthByList, episodes: EpisodeLists, from_m: tuple[float, float],
+    params: AccuracyParameters, room: ListScratch, targets: Targets,
 ) -> tuple[int, int]:  # fmt: skip
     # Out: the objects whose stay includes list k, those in a gap of the truth last. Returns their number, and the
     # number of those that are looked at.
-    n = wanted = 0
+    n = n_true = 0
     for p in range(world.start[k], world.start[k + 1]):
-        m = stays.episode_of[world.object_ix[p]]
-        if m < 0 or k < stays.first_list[m] or k >= stays.first_list[m] + stays.lists[m]:
+        m = episodes.episode_of[world.object_ix[p]]
+        if m < 0 or k < episodes.first_list[m] or k >= episodes.first_list[m] + episodes.lists[m]:
             continue
         away_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
-        here.episode[n], here.row[n], here.place_of[m] = m, p, n
-        here.distance_band[n], here.target[n] = _find_band(asked.distance_edges_m, away_m), -1
-        if issue_s >= stays.onset_s[m] - SAME_INSTANT_S:
-            here.target[n] = wanted
-            targets.episode[wanted], targets.column[wanted] = m, stays.column[m] + k - stays.first_list[m]
-            targets.x_m[wanted], targets.y_m[wanted] = world.x_m[p], world.y_m[p]
-            wanted += 1
+        room.episode[n], room.row[n], room.place_of[m] = m, p, n
+        room.distance_band[n], room.target[n] = _find_band(params.distance_edges_m, away_m), -1
+        if issue_s >= episodes.onset_s[m] - SAME_INSTANT_S:
+            room.target[n] = n_true
+            targets.episode[n_true], targets.column[n_true] = m, episodes.column[m] + k - episodes.first_list[m]
+            targets.x_m[n_true], targets.y_m[n_true] = world.x_m[p], world.y_m[p]
+            n_true += 1
         n += 1
-    for m in range(len(stays.lists)):
-        if here.place_of[m] < 0 and stays.first_list[m] <= k < stays.first_list[m] + stays.lists[m]:
-            here.episode[n], here.row[n], here.place_of[m] = m, -1, n
-            here.distance_band[n] = here.target[n] = -1
+    for m in range(len(episodes.lists)):
+        if room.place_of[m] < 0 and episodes.first_list[m] <= k < episodes.first_list[m] + episodes.lists[m]:
+            room.episode[n], room.row[n], room.place_of[m] = m, -1, n
+            room.distance_band[n] = room.target[n] = -1
             n += 1
-    return n, wanted
+    return n, n_true
 
 
 @borrowing
 def _add_entries(
-    s: int, first: int, after: int, entries: Entries, about: EntryMatches, now: EntryMatches, stays: EpisodeLists,
-    from_m: tuple[float, float], time_band: int, asked: AccuracyParameters, here: ListScratch, targets: Targets,
-    wanted: int, estimates: Estimates, out: AccuracySums,
+    s: int, first: int, after: int, entries: Entries, matches: EntryMatches, now: EntryMatches, episodes: EpisodeLists,
+    from_m: tuple[float, float], time_band: int, params: AccuracyParameters, room: ListScratch, targets: Targets,
+    n_true: int, estimates: Estimates, out: AccuracySums,
 ) -> int:  # fmt: skip
     # Find the matches in a list of run s and count its other entries. Returns the number of entries in GOSPA.
     count = 0
     for i in range(first, after):
-        if about.role[i] == MATCH:
-            m = stays.episode_of[about.object_ix[i]]
-            if m >= 0 and here.place_of[m] >= 0:
-                here.pair[here.place_of[m]] = i
-        m = stays.episode_of[now.object_ix[i]] if now.role[i] != GHOST else -1
-        h = here.place_of[m] if m >= 0 else -1
-        target = here.target[h] if h >= 0 else -1
+        if matches.role[i] == MATCH:
+            m = episodes.episode_of[matches.object_ix[i]]
+            if m >= 0 and room.place_of[m] >= 0:
+                room.pair[room.place_of[m]] = i
+        m = episodes.episode_of[now.object_ix[i]] if now.role[i] != GHOST else -1
+        h = room.place_of[m] if m >= 0 else -1
+        target = room.target[h] if h >= 0 else -1
         if now.role[i] == MATCH and h >= 0:
-            here.match[h] = i
+            room.match[h] = i
         elif now.role[i] == DUPLICATE and m >= 0:
             out.by_run[s].duplicates += 1
             if target >= 0:
                 out.by_object[s, m].duplicates += 1
-        measured = asked.measured_class[about.class_ix[i]]
+        measured = params.measured_class[matches.class_ix[i]]
         nowhere = now.role[i] == GHOST
-        if (nowhere or about.role[i] == GHOST) and measured:
+        if (nowhere or matches.role[i] == GHOST) and measured:
             annotated = is_in_area(
-                entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], asked.annotated_m, asked.annotated_range_m
+                entries[i].x_m, entries[i].y_m, from_m[0], from_m[1], params.annotated_m, params.annotated_range_m
             )
             if not annotated and nowhere:
                 out.by_run[s].unannotated += 1
                 nowhere = False
-            if not annotated and about.role[i] == GHOST:
+            if not annotated and matches.role[i] == GHOST:
                 measured = False
         if target >= 0 or (nowhere and measured):
             estimates.x_m[count], estimates.y_m[count] = entries[i].x_m, entries[i].y_m
@@ -352,10 +352,10 @@ def _add_entries(
             claim = out.by_existence[s, min(max(int(existence * bins), 0), bins - 1)]
             claim.entries += 1
             claim.existence += existence
-            claim.with_object += about.role[i] != GHOST
-            if nowhere and about.role[i] == GHOST:
+            claim.with_object += matches.role[i] != GHOST
+            if nowhere and matches.role[i] == GHOST:
                 _add_false_positive(
-                    s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, asked, targets, wanted, out
+                    s, entries[i].x_m, entries[i].y_m, existence, from_m, time_band, params, targets, n_true, out
                 )
             elif nowhere:
                 out.by_run[s].stale_ghosts += 1
@@ -365,17 +365,17 @@ def _add_entries(
 @borrowing
 def _add_false_positive(
     s: int, x_m: float, y_m: float, existence: float, from_m: tuple[float, float], time_band: int,
-    asked: AccuracyParameters, targets: Targets, wanted: int, out: AccuracySums,
+    params: AccuracyParameters, targets: Targets, n_true: int, out: AccuracySums,
 ) -> None:  # fmt: skip
     out.by_run[s].ghosts += 1
-    for q in range(len(asked.existence_thresholds)):
-        out.ghosts_at[s, q] += existence >= asked.existence_thresholds[q]
-    distance_band = _find_band(asked.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
+    for q in range(len(params.existence_thresholds)):
+        out.ghosts_at[s, q] += existence >= params.existence_thresholds[q]
+    distance_band = _find_band(params.distance_edges_m, np.hypot(x_m - from_m[0], y_m - from_m[1]))
     if distance_band >= 0:
         out.by_distance[s, distance_band].ghosts += 1
     if time_band >= 0:
         out.by_time[s, time_band].ghosts += 1
-    nearest = find_nearest_target(x_m, y_m, targets, wanted)
+    nearest = find_nearest_target(x_m, y_m, targets, n_true)
     if nearest >= 0:
         out.by_object[s, targets.episode[nearest]].ghosts += 1
 
@@ -441,17 +441,17 @@ def _add_pair(records: Records, band: int, east_m: float, north_m: float, nees: 
 
 @borrowing
 def _add_gospa(
-    gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: Targets, wanted: int,
-    estimates: Estimates, count: int, asked: AccuracyParameters,
+    gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: Targets, n_true: int,
+    estimates: Estimates, count: int, params: AccuracyParameters,
 ) -> None:  # fmt: skip
     # The GOSPA of one list, divided among the objects, and its OSPA: the same pairs are the best ones for both.
-    if wanted == 0:
+    if n_true == 0:
         return
     sums.lists_looked += 1
-    localisation, pairs = divide_gospa(targets, wanted, estimates, count, asked.cutoff_m, asked.power)
-    most = max(wanted, count)
-    sums.ospa_m += ((localisation + asked.cutoff_m**asked.power * (most - pairs)) / most) ** (1.0 / asked.power)
-    for t in range(wanted):
+    localisation, pairs = divide_gospa(targets, n_true, estimates, count, params.cutoff_m, params.power)
+    most = max(n_true, count)
+    sums.ospa_m += ((localisation + params.cutoff_m**params.power * (most - pairs)) / most) ** (1.0 / params.power)
+    for t in range(n_true):
         m = targets.episode[t]
         by_object[m].gospa_localisation += targets.located[t]
         by_object[m].gospa_missed += targets.missed[t]
@@ -461,19 +461,19 @@ def _add_gospa(
 
 @borrowing
 def divide_gospa(
-    targets: Targets, wanted: int, estimates: Estimates, count: int, cutoff_m: float, power: float
+    targets: Targets, n_true: int, estimates: Estimates, count: int, cutoff_m: float, power: float
 ) -> tuple[float, int]:
-    """Divide GOSPAᵖ among `wanted` objects, one at least, given `count` entries.
+    """Divide GOSPAᵖ among `n_true` objects, one at least, given `count` entries.
 
-    Out: `targets.located`, `missed` and `false`. Gives Σ dᵖ over the pairs, and how many they are.
+    Out: `targets.located`, `missed` and `false`. Returns Σ dᵖ over the pairs and their number.
     """
     unit = cutoff_m**power
     localisation, pairs = gospa_pairs(
-        targets.x_m[:wanted], targets.y_m[:wanted], estimates.x_m[:count], estimates.y_m[:count],
-        cutoff_m, power, targets.partner[:wanted],
+        targets.x_m[:n_true], targets.y_m[:n_true], estimates.x_m[:count], estimates.y_m[:count],
+        cutoff_m, power, targets.partner[:n_true],
     )  # fmt: skip
     estimates.paired[:count] = False
-    for t in range(wanted):
+    for t in range(n_true):
         b = targets.partner[t]
         targets.located[t] = targets.missed[t] = targets.false[t] = 0.0
         if b >= 0:
@@ -484,15 +484,15 @@ def divide_gospa(
             targets.missed[t] = unit / 2
     for b in range(count):
         if not estimates.paired[b]:
-            targets.false[find_nearest_target(estimates.x_m[b], estimates.y_m[b], targets, wanted)] += 1
-    for t in range(wanted):
+            targets.false[find_nearest_target(estimates.x_m[b], estimates.y_m[b], targets, n_true)] += 1
+    for t in range(n_true):
         targets.false[t] *= unit / 2
     return localisation, pairs
 
 
 @borrowing
 def find_nearest_target(x_m: float, y_m: float, targets: Targets, wanted: int) -> int:
-    """The target nearest to a place, of equally near ones the first; −1: there are none."""
+    """Index of the target nearest to a place, the first of equally near ones; −1: there are none."""
     best, least = -1, np.inf
     for t in range(wanted):
         square = (targets.x_m[t] - x_m) ** 2 + (targets.y_m[t] - y_m) ** 2

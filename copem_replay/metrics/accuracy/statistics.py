@@ -159,7 +159,7 @@ _PER_RUN = tuple(f.name for f in fields(Accuracy) if f.name not in ("settings", 
 
 
 def repeat_for_runs(accuracy: Accuracy, runs: int) -> Accuracy:
-    """Statistics of `runs` runs, each as the one run that stands for all."""
+    """The statistics of `runs` equal runs, from those of one."""
     if len(accuracy.by_run) == runs:
         return accuracy
     columns: dict[str, Any] = {

@@ -64,13 +64,13 @@ class BrakingEgo:
         driving: Bool = ~np.isnan(course.along_m) & (course.speed_mps >= self.slower_mps)
         return driving
 
-    def must_brake(self, time_s: Float, which: Int, states: Float, *, margin_m: float, share: float) -> Bool:
-        """(N,) whether the driver must brake for states (N, 8 or more) that are listed at instants `which (N,)` of
+    def must_brake(self, time_s: Float, instant_ix: Int, states: Float, *, margin_m: float, share: float) -> Bool:
+        """(N,) whether the driver must brake for states (N, 8 or more) that are listed at instants `instant_ix (N,)` of
         `time_s (K,)`; −1: at none.
 
         Raises InputError where a driver of the user's own fails.
         """
-        out = np.zeros(len(which), dtype=np.bool_)
+        out = np.zeros(len(instant_ix), dtype=np.bool_)
         course = self.path.course(time_s)
         driving = np.flatnonzero(self._is_driving(course))
         row_of = np.full(len(time_s), -1)
@@ -81,7 +81,7 @@ class BrakingEgo:
             row_of[block] = np.arange(len(block))
             _mark_demands(
                 self.path.path, self.path.size_m, course.along_m[block], course.speed_mps[block], deceleration,
-                instants, self._reaction_s, row_of, which, states, margin_m, share,
+                instants, self._reaction_s, row_of, instant_ix, states, margin_m, share,
                 np.empty((len(block), instants.max(), 3)), out,
             )  # fmt: skip
         return out
@@ -111,14 +111,14 @@ class BrakingEgo:
 @borrowing_kernel
 def _mark_demands(
     path: Float, size: Float, along: Float, speed: Float, deceleration: Float, instants: Int, reaction_s: float,
-    row_of: Int, which: Int, states: Float, margin_m: float, share: float, poses: Float, out: Bool,
+    row_of: Int, instant_ix: Int, states: Float, margin_m: float, share: float, poses: Float, out: Bool,
 ) -> None:  # fmt: skip
     """Out: `out (N,)`. `row_of (K,)`: the row of `along`, `speed`, …, −1: none. `poses (K, J + 1, 3)`: scratch."""
     for k in range(len(along)):
         for j in range(instants[k]):
             poses[k, j, 0], poses[k, j, 1], poses[k, j, 2] = pose_on_path(path, along[k] + speed[k] * j * STEP_S)
-    for n in range(len(which)):
-        k = row_of[which[n]] if which[n] >= 0 else -1
+    for n in range(len(instant_ix)):
+        k = row_of[instant_ix[n]] if instant_ix[n] >= 0 else -1
         if k >= 0:
             out[n] = _must_brake(
                 path, size, along[k], speed[k], deceleration[k], reaction_s, states[n], margin_m, share, poses[k],
@@ -189,9 +189,7 @@ def _is_hit(
 
 @borrowing
 def _distance(x: float, y: float, yaw: float, size: Float, state: Float, after_s: float, radii: float) -> float:
-    """Distance of the ego's box at a pose from the entry's after some time; inf where centres are farther than `radii`
-    from each other.
-    """
+    """Distance of the ego's box from the entry's after some time; inf where centres are `radii` apart or more."""
     ex, ey = state[X] + state[VX] * after_s, state[Y] + state[VY] * after_s
     if (ex - x) ** 2 + (ey - y) ** 2 > radii * radii:
         return np.inf

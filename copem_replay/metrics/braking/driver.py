@@ -193,13 +193,13 @@ def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
     Raises InputError for an invalid probability, or one that contradicts the delays of the model.
     """
     where = "braking.driver.reaction"
-    what = "survival(delay_s)"
+    call = "survival(delay_s)"
 
     def survival(of_s: Float) -> Float | None:
         answer = ask_component(reaction, where, lambda: reaction.survival(of_s))
         if answer is None:
             return None
-        return ask_numbers(reaction, where, what, lambda: answer, of_s.shape, "probabilities 0 … 1", 1.0)
+        return ask_numbers(reaction, where, call, lambda: answer, of_s.shape, "probabilities 0 … 1", 1.0)
 
     survivals = survival(delay_s)
     if survivals is None:
@@ -207,15 +207,15 @@ def reaction_survival(reaction: Reaction, delay_s: Float) -> Float | None:
     # Whatever the distribution, P(D > d) ≤ 1 − u ≤ P(D ≥ d): compared a hair beside d, for rounding.
     at_s = reaction_delays(reaction, _TRIED)
     for hair, sign in ((1e-9, 1), (-1e-9, -1)):
-        beside = survival(np.nextafter(at_s * (1 + hair), sign * np.inf))  # of the smallest numbers a hair is none
-        assert beside is not None
-        off = np.flatnonzero((sign * (beside - (1 - _TRIED)) > 1e-6) & (at_s > 0))
+        probability = survival(np.nextafter(at_s * (1 + hair), sign * np.inf))  # of the smallest numbers a hair is none
+        assert probability is not None
+        off = np.flatnonzero((sign * (probability - (1 - _TRIED)) > 1e-6) & (at_s > 0))
         if len(off):
             k = off[0]
             raise wrong_answer_error(
                 reaction, where,
-                f"{what}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
-                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {beside[k]:g}", "survival",
+                f"{call}: expected at {at_s[k]:g} s, which is delays({_TRIED[k]:g}), "
+                f"at {'most' if sign > 0 else 'least'} {1 - _TRIED[k]:g}; found {probability[k]:g}", "survival",
             )  # fmt: skip
     return survivals
 

@@ -27,9 +27,9 @@ JUDGED_DRIVING = RATE, SHARE = "needless_brakes_per_h", "needless_brake_share"
 
 @dataclass(frozen=True)
 class Drives:
-    """Driving and needless braking of one configuration, of K drives; or of the runs of one, if `over` says so.
+    """Driving and needless braking of one configuration in K drives, or in K runs of one drive (`over`).
 
-    `brakes`: mean over runs of how often. `over`: what limits are over; None: of two logs there are none.
+    `brakes`: how many, the mean over runs. `over`: what limits are over; None: of two logs there are none.
     """
 
     hours: Float
@@ -65,7 +65,7 @@ class Drives:
         return limit_left_out(value, without, self.hours, (0.0, 1.0), confidence, unseen, runs)
 
     def limit(self, metric: str, confidence: float) -> LimitedFigure:
-        """The limits of `RATE` or `SHARE`."""
+        """`limit_rate` or `limit_share`, by the name of the figure: `RATE` or `SHARE`."""
         return self.limit_rate(confidence) if metric == RATE else self.limit_share(confidence)
 
 
@@ -81,11 +81,11 @@ def sum_drives(rows: pd.DataFrame | None, *, of_runs: bool = False) -> Drives | 
     names = ["runs", "driving_s", "needless_brakes", "needless_s", "must_brake_s", "must_brake_missed_s"]
     by_log = rows.groupby("log", sort=False)[names].sum()
     over = "logs" if len(by_log) >= FEWEST_LOGS else None
-    by, times = by_log, by_log["runs"]
+    totals, times = by_log, by_log["runs"]
     if (of_runs or len(by_log) == 1) and "run" in rows and rows["run"].nunique() > 1:
-        over, by = "runs", rows.groupby("run", sort=True)[names].sum()
-        times = by["runs"] / len(by_log)
-    hours, brakes, needless = (by[name].to_numpy(dtype=float) / times.to_numpy(dtype=float) for name in names[1:4])
+        over, totals = "runs", rows.groupby("run", sort=True)[names].sum()
+        times = totals["runs"] / len(by_log)
+    hours, brakes, needless = (totals[name].to_numpy(dtype=float) / times.to_numpy(dtype=float) for name in names[1:4])
     must_brake_s, missed_s = (float((by_log[name] / by_log["runs"]).sum()) for name in names[4:])
     lost_mps = float(rows["speed_lost_mps"].max())
     return Drives(hours / 3600, brakes, needless / 3600, lost_mps, must_brake_s, missed_s, over)
@@ -95,20 +95,20 @@ def _measure(inputs: MetricInputs) -> Drives | None:
     return sum_drives(inputs.driving)
 
 
-def _hours(of: Drives) -> float:
-    return float(of.hours.mean() if of.over == "runs" else of.hours.sum())
+def _hours(drives: Drives) -> float:
+    return float(drives.hours.mean() if drives.over == "runs" else drives.hours.sum())
 
 
 def _end(limit: Callable[[Drives], LimitedFigure], end: str) -> Callable[[Drives], float | None]:
-    def value(of: Drives) -> float | None:
-        number = getattr(limit(of), end)
+    def value(drives: Drives) -> float | None:
+        number = getattr(limit(drives), end)
         return None if number is None or np.isnan(number) else float(number)
 
     return value
 
 
 def _if_driving(name: str) -> Callable[[Drives], float | None]:
-    return lambda of: getattr(of, name) if of.hours.sum() > 0 else None
+    return lambda drives: getattr(drives, name) if drives.hours.sum() > 0 else None
 
 
 DRIVING = (

@@ -40,7 +40,7 @@ REVERSAL_M = 2.0
 
 @dataclass(frozen=True)
 class Course:
-    """The ego that does not brake, at T instants.
+    """The course of the ego that does not brake, at T instants.
 
     `along_m (T,)`: way from the first vertex of the path, NaN where the ego is not in the log. `bound_m (T,)`: that way
     with gaps closed, and beyond the ego's last frame, `until_s`, with its last speed; the ego is never farther.
@@ -86,7 +86,7 @@ class EgoPath:
         return Course(np.where(present, bound, np.nan), bound, speed, last_s + SAME_INSTANT_S)
 
     def locate(self, along_m: Float) -> tuple[Float, Float]:
-        """Places (K,) so far along the path, straight on beyond its ends."""
+        """Places (K,) at these distances along the path; beyond its ends it goes straight on."""
         path = self.path
         k = np.clip(np.searchsorted(path[:, 0], along_m) - 1, 0, len(path) - 2)
         f = (along_m - path[k, 0]) / (path[k + 1, 0] - path[k, 0])
@@ -127,21 +127,21 @@ def _choose_vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, re
     away against it, which turns that direction round. The last place, if ahead of the last vertex by less than a
     stride, is a vertex instead of that: in a bend the ego heads elsewhere a decimetre before.
     """
-    kept = np.empty(len(x_m), dtype=np.int64)
-    kept[0] = 0
+    vertices = np.empty(len(x_m), dtype=np.int64)
+    vertices[0] = 0
     n, backwards = 1, False
     for k in range(1, len(x_m)):
-        dx, dy = x_m[k] - x_m[kept[n - 1]], y_m[k] - y_m[kept[n - 1]]
-        against = (dx * np.cos(yaw_rad[k]) + dy * np.sin(yaw_rad[k]) < 0) != backwards
-        if np.hypot(dx, dy) >= (reversal_m if against else stride_m):
-            kept[n] = k
+        dx, dy = x_m[k] - x_m[vertices[n - 1]], y_m[k] - y_m[vertices[n - 1]]
+        reverses = (dx * np.cos(yaw_rad[k]) + dy * np.sin(yaw_rad[k]) < 0) != backwards
+        if np.hypot(dx, dy) >= (reversal_m if reverses else stride_m):
+            vertices[n] = k
             n += 1
-            backwards = backwards != against
-        elif k == len(x_m) - 1 and n > 1 and not against:
-            dx, dy = x_m[k] - x_m[kept[n - 2]], y_m[k] - y_m[kept[n - 2]]
+            backwards = backwards != reverses
+        elif k == len(x_m) - 1 and n > 1 and not reverses:
+            dx, dy = x_m[k] - x_m[vertices[n - 2]], y_m[k] - y_m[vertices[n - 2]]
             if np.hypot(dx, dy) >= stride_m:
-                kept[n - 1] = k
-    return kept[:n].copy(), backwards
+                vertices[n - 1] = k
+    return vertices[:n].copy(), backwards
 
 
 # The stretches of its path that the ego must not be on, and the deceleration that avoids them. Compiled.
@@ -312,10 +312,10 @@ def _find_encounter(
     margin_m: float,
 ) -> Encounter | None:  # fmt: skip
     """The encounter of one episode, None where the ego, not braking, stays clear."""
-    own_s = truth.row_captured_s[rows]
-    last_s = max(float(own_s[-1]), onset_s)
+    captured_s = truth.row_captured_s[rows]
+    last_s = max(float(captured_s[-1]), onset_s)
     regular = onset_s + NODE_S * np.arange(int((last_s - onset_s) / NODE_S) + 1)
-    frames = own_s[(own_s > onset_s) & (own_s <= last_s)]
+    frames = captured_s[(captured_s > onset_s) & (captured_s <= last_s)]
     time_s = np.unique(np.round(np.concatenate([regular, frames]), 9))  # to a nanosecond: equal instants are one
     states, _ = ego.states(int(truth.row_object_ix[rows[0]]), time_s)
     course = ego.course(time_s, constant_from_s)

@@ -77,7 +77,7 @@ class TruthDemand:
 
 
 def find_truth_demand(
-    braking: BrakingEgo, asked: Needless, scene: Scene, truth: Tracks, max_gap_s: float
+    braking: BrakingEgo, settings: Needless, scene: Scene, truth: Tracks, max_gap_s: float
 ) -> TruthDemand:
     """When the truth of a log gives a reason to brake. Raises InputError where a driver of the user's own fails."""
     time_s = np.arange(0.0, scene.end_s + SAME_INSTANT_S, _GRID_S)
@@ -89,16 +89,16 @@ def find_truth_demand(
     count = np.where(truth.object_ix == scene.ego_ix, 0, np.maximum(end - begin, 0))
     cuts = np.flatnonzero(np.diff(np.cumsum(count) // _ROWS)) + 1
     for tracks in np.split(np.arange(len(count)), cuts):
-        which = np.concatenate([np.arange(begin[k], begin[k] + count[k]) for k in tracks.tolist()] or [np.arange(0)])
+        steps = np.concatenate([np.arange(begin[k], begin[k] + count[k]) for k in tracks.tolist()] or [np.arange(0)])
         objects = np.repeat(truth.object_ix[tracks], count[tracks])
-        states, present = interpolate_states(truth, objects, time_s[which], t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
-        rows, which = _stack_states(states)[present], which[present]
-        soft = braking.must_brake(time_s, which, rows, margin_m=asked.wider_m, share=asked.needed_at)
-        needed[which[soft]] = True
-        hard = braking.must_brake(time_s, which, rows, margin_m=asked.margin_m, share=asked.brakes_at)
-        must[which[hard]] = True
+        states, present = interpolate_states(truth, objects, time_s[steps], t0_ns=scene.t0_ns, max_gap_s=max_gap_s)
+        rows, steps = _stack_states(states)[present], steps[present]
+        soft = braking.must_brake(time_s, steps, rows, margin_m=settings.wider_m, share=settings.needed_at)
+        needed[steps[soft]] = True
+        hard = braking.must_brake(time_s, steps, rows, margin_m=settings.margin_m, share=settings.brakes_at)
+        must[steps[hard]] = True
     driven_s = _add_up_driving(braking, max_gap_s)
-    return TruthDemand(braking, asked, scene, truth, max_gap_s, time_s, must, needed, driven_s)
+    return TruthDemand(braking, settings, scene, truth, max_gap_s, time_s, must, needed, driven_s)
 
 
 def _stack_states(states: dict[str, Float]) -> Float:
@@ -113,12 +113,12 @@ def _add_up_driving(braking: BrakingEgo, max_gap_s: float) -> Float:
 
 @dataclass(frozen=True)
 class NeedlessBraking:
-    """Needless braking of a configuration in S runs, seconds and m/s.
+    """Needless braking of a configuration in S runs, in seconds and m/s.
 
-    `brakes`, `needless_s`, `speed_lost_mps` (the most), `missed_s (S,)`: must brake by the truth, and does not.
-    `needless_s_at (S, T)`: with entries of at least each existence alone. The others are of events (E,), by run and
-    begin: `entries`: by which they are, `class_ix`: the most probable classes of these, `object_id`: of the true
-    objects that they are about, None: none.
+    Per run (S,): `brakes`, the number of events; `needless_s`; `speed_lost_mps`, the most; `missed_s`: the truth
+    demands braking and the driver does not. `needless_s_at (S, T)`: `needless_s` of only the entries of at least each
+    existence. Per event (E,), by run and begin: `entries` that cause it, `class_ix`: their most probable classes,
+    `object_id`: the true objects that they match, None: none.
     """
 
     driving_s: float
@@ -138,7 +138,7 @@ class NeedlessBraking:
     object_id: np.ndarray
 
     def repeated(self, runs: int) -> NeedlessBraking:
-        """Of `runs` runs, each as the one run that stands for all."""
+        """The braking of `runs` equal runs, from that of one."""
         if len(self.brakes) == runs:
             return self
         per_run = {
@@ -175,24 +175,24 @@ class NeedlessDetector:
         self._parts: list[tuple[Int, Int, Entries, Int, Int, Int]] = []
 
     def add(self, lists: ObjectLists, matches: Matches, tells_of: TellsOf) -> None:
-        """Add the lists of a time chunk, and what their entries are about at the instant that they tell of."""
+        """Add the lists of a time chunk, with the matches of their entries at the instant that they tell of."""
         self._tells_of = tells_of
-        braking, asked = self._truth.braking, self._truth.asked
+        braking, settings = self._truth.braking, self._truth.asked
         count = lists.start.shape[1] - 1
-        which = np.full(len(lists.entries), -1)
+        list_ix = np.full(len(lists.entries), -1)
         for start in lists.start:
-            which[start[0] : start[-1]] = np.repeat(np.arange(count), np.diff(start))
+            list_ix[start[0] : start[-1]] = np.repeat(np.arange(count), np.diff(start))
         issue_s = self._issue_s[self._added : self._added + count]
         demands = braking.must_brake(
-            issue_s, which, view_as_numbers(lists.entries), margin_m=asked.margin_m, share=asked.brakes_at
+            issue_s, list_ix, view_as_numbers(lists.entries), margin_m=settings.margin_m, share=settings.brakes_at
         )
-        which += self._added
+        list_ix += self._added
         rows = np.flatnonzero(demands & (matches.object_ix != self._truth.scene.ego_ix))
         x_m, y_m = (lists.entries[name][rows] for name in ("x_m", "y_m"))
-        rows = rows[are_annotated(x_m, y_m, which[rows], self._reference, self._settings)]
+        rows = rows[are_annotated(x_m, y_m, list_ix[rows], self._reference, self._settings)]
         run_ix = np.searchsorted(lists.start[:, 0], rows, side="right") - 1
-        rows, run_ix = self._choose_surest(lists.entries, rows, run_ix, which)
-        entries, k = take_entries(lists.entries, rows), which[rows]
+        rows, run_ix = self._choose_surest(lists.entries, rows, run_ix, list_ix)
+        entries, k = take_entries(lists.entries, rows), list_ix[rows]
         self._existence[run_ix, k] = entries["existence"]
         self._parts.append(
             (run_ix, k, entries, matches.object_ix[rows], matches.role[rows].astype(np.int64),
@@ -220,10 +220,10 @@ class NeedlessDetector:
         first, after = _join_events(run_ix, self._issue_s[k], lasts_s[k], truth.asked.merge_s)
         needless_s = np.add.reduceat(lasts_s[k], first) if len(first) else np.zeros(0)
         begin_run, begin_k = run_ix[first], k[first]
-        lost = self._lose_speed(self._issue_s[begin_k], needless_s)
+        lost_mps = self._lose_speed(self._issue_s[begin_k], needless_s)
         entries, object_ix, role, class_ix = self._find_entries(begin_run, begin_k)
         speed_lost = np.zeros(runs)
-        np.maximum.at(speed_lost, begin_run, lost)
+        np.maximum.at(speed_lost, begin_run, lost_mps)
         return NeedlessBraking(
             driving_s=truth.driving_s,
             must_brake_s=float(truth.must.sum() * _GRID_S),
@@ -235,7 +235,7 @@ class NeedlessDetector:
             run_ix=begin_run,
             begins_s=self._issue_s[begin_k],
             lasts_s=self._issue_s[k[after - 1]] + lasts_s[k[after - 1]] - self._issue_s[begin_k],
-            lost_mps=lost,
+            lost_mps=lost_mps,
             cause=self._find_causes(entries, object_ix, role, self._issue_s[begin_k]),
             entries=entries,
             class_ix=class_ix,
@@ -243,13 +243,13 @@ class NeedlessDetector:
         )
 
     def _confirmed(self, demands: Bool) -> Bool:
-        """(S, K) whether `hits` of the last `of` lists demand braking, this one among them."""
-        hits, of = self._confirm.hits, self._confirm.of
-        if of == 1:
+        """(S, K) whether at least `hits` of the last `window` lists, this one included, demand braking."""
+        hits, window = self._confirm.hits, self._confirm.of
+        if window == 1:
             return demands
         count = np.cumsum(demands, axis=1)
         before = np.zeros_like(count)
-        before[:, of:] = count[:, :-of]
+        before[:, window:] = count[:, :-window]
         return np.asarray(count - before >= hits)
 
     def _list_lasts_s(self) -> Float:
@@ -271,45 +271,45 @@ class NeedlessDetector:
         """(S, T) needless seconds with entries of at least each existence."""
         thresholds = np.array(self._settings.existence_thresholds, dtype=np.float32)
         levels = np.unique(self._existence[self._existence >= 0.0])
-        above = np.searchsorted(levels, thresholds, side="left")
-        found = np.zeros((len(self._existence), len(thresholds)))
-        for place in np.unique(above[above < len(levels)]).tolist():
+        level_ix = np.searchsorted(levels, thresholds, side="left")
+        needless_s = np.zeros((len(self._existence), len(thresholds)))
+        for place in np.unique(level_ix[level_ix < len(levels)]).tolist():
             needless = self._confirmed(self._existence >= levels[place]) & driving
-            found[:, above == place] = _add_up(needless, lasts_s)[:, None]
-        return found
+            needless_s[:, level_ix == place] = _add_up(needless, lasts_s)[:, None]
+        return needless_s
 
     def _miss(self, brakes: Bool, lasts_s: Float) -> Float:
         """(S,) seconds in which the driver must brake by the truth, and does not."""
         truth = self._truth
         at_s = truth.time_s[truth.must]
-        held = np.searchsorted(self._issue_s, at_s + SAME_INSTANT_S, side="right") - 1
-        valid = held >= 0
-        valid[valid] = at_s[valid] - self._issue_s[held[valid]] <= lasts_s[held[valid]] + SAME_INSTANT_S
+        list_ix = np.searchsorted(self._issue_s, at_s + SAME_INSTANT_S, side="right") - 1
+        valid = list_ix >= 0
+        valid[valid] = at_s[valid] - self._issue_s[list_ix[valid]] <= lasts_s[list_ix[valid]] + SAME_INSTANT_S
         missed = np.full(len(brakes), float((~valid).sum()))
-        missed += (~brakes[:, held[valid]]).sum(axis=1)
+        missed += (~brakes[:, list_ix[valid]]).sum(axis=1)
         return missed * _GRID_S
 
     def _find_entries(self, run_ix: Int, k: Int) -> tuple[Entries, Int, Int, Int]:
         """The surest entry of each run and list (E,) that demands braking, or that did in the lists that confirm it."""
-        none = np.empty(0, dtype=np.int64)
-        runs, lists, _, objects, roles, classes = zip(*self._parts, strict=True) if self._parts else ([none],) * 6
-        key = np.concatenate([none, *runs]) * len(self._issue_s) + np.concatenate([none, *lists])
+        empty = np.empty(0, dtype=np.int64)
+        runs, lists, _, objects, roles, classes = zip(*self._parts, strict=True) if self._parts else ([empty],) * 6
+        key = np.concatenate([empty, *runs]) * len(self._issue_s) + np.concatenate([empty, *lists])
         order = np.argsort(key, kind="stable")
         place = order[np.searchsorted(key[order], run_ix * len(self._issue_s) + k, side="right") - 1]
         entries = join_entries([part[2] for part in self._parts])
-        columns = (np.concatenate([none, *column])[place] for column in (objects, roles, classes))
+        columns = (np.concatenate([empty, *column])[place] for column in (objects, roles, classes))
         object_ix, role, class_ix = columns
         return take_entries(entries, place), object_ix, role, class_ix
 
     def _find_causes(self, entries: Entries, object_ix: Int, role: Int, time_s: Float) -> np.ndarray:
         """(E,) of `CAUSES`."""
-        truth, asked = self._truth, self._truth.asked
+        truth, settings = self._truth, self._truth.asked
         states, present = interpolate_states(
             truth.truth, object_ix, np.ascontiguousarray(entries["captured_s"]), t0_ns=truth.scene.t0_ns,
             max_gap_s=truth.max_gap_s,
         )  # fmt: skip
         late = truth.braking.must_brake(
-            time_s, np.arange(len(time_s)), _stack_states(states), margin_m=asked.wider_m, share=asked.needed_at
+            time_s, np.arange(len(time_s)), _stack_states(states), margin_m=settings.wider_m, share=settings.needed_at
         )
         is_late = late & present & (self._tells_of == "capture")
         return np.select(

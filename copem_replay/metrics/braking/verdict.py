@@ -72,12 +72,12 @@ def judge_braking(encounter: Encounter, driver: Driver, brake_s: Float) -> Verdi
     begin_m, begin_mps, ever = _find_braking_start(encounter, unique)
     late = unique >= encounter.spent_s
     verdicts.required_mps2[ever & late] = np.inf
-    asked = np.flatnonzero(ever & ~late)
-    need = np.empty(len(asked))
+    braked = np.flatnonzero(ever & ~late)
+    need = np.empty(len(braked))
     find_required_deceleration(
-        encounter.time_s, encounter.stretch_m, unique[asked], begin_m[asked], begin_mps[asked], need
+        encounter.time_s, encounter.stretch_m, unique[braked], begin_m[braked], begin_mps[braked], need
     )
-    verdicts.required_mps2[asked] = need
+    verdicts.required_mps2[braked] = need
     return Verdicts(*(getattr(verdicts, name)[index] for name in Verdicts.__dataclass_fields__))
 
 
@@ -196,9 +196,7 @@ def _probability_between(between_s: Float, known_s: Float, reaction: Reaction) -
 
 
 def _reaction_tails(reaction: Reaction, delay_s: Float) -> tuple[Float, Float, bool]:
-    """Probabilities (K,) that a reaction takes at most, and longer than, `delay_s (K,)`; whether both are exact far
-    out.
-    """
+    """Probabilities (K,) of a reaction of at most, and longer than, `delay_s (K,)`; whether both are exact far out."""
     within = np.where(delay_s > 0, 1.0, 0.0)
     possible = np.isfinite(delay_s) & (delay_s >= 0)
     possible_s = delay_s[possible]

@@ -64,15 +64,14 @@ class Confirming(NamedTuple):
 
 @kernel
 def find_existence_levels(
-    lists: MatchedLists, stays: EpisodeWindows, origins: Origins, confirming: Confirming, best: Float,
-    held: NDArray[Any], level: Float, by_list: Int,
+    lists: MatchedLists, episodes: EpisodeWindows, origins: Origins, confirming: Confirming, best: Float,
+    carry: NDArray[Any], level: Float, by_list: Int,
 ) -> NDArray[Any]:  # fmt: skip
-    """Write, at an entry of each list that makes an object known at a higher existence than before, that existence to
-    `level (N,)`, and to `by_list (N,)` the newest list that entries about it go back to and that holds it.
+    """Find each entry (N,) that makes an object known at a higher existence than any entry before it.
 
-    Carried over: `best (S, M)`, the existence at which each object is known; `held`, by run and episode, returned as it
-    is after these lists. A turn that holds an object with no higher existence than it is known at is dropped: whatever
-    it would confirm, as many hits have confirmed already.
+    Out: `level (N,)`, that existence; `by_list (N,)`, the newest list that holds the object and from which such entries
+    come. Updated from chunk to chunk: `best (S, M)`, the highest existence so far; `carry`, the turns that still count,
+    by run and episode, whose new state is returned. A turn whose existence is not above `best` is dropped.
     """
     S, M = best.shape
     most = 0
@@ -81,42 +80,42 @@ def find_existence_levels(
     episode, first = np.empty(most, np.int64), np.empty(M + 1, np.int64)
     row, number = np.empty(most, np.int64), np.empty(most, np.int64)
     holds = np.full(len(confirming.group), -np.inf)  # by turn, of the episode at hand
-    used, within = np.empty(len(holds), np.int64), np.empty(confirming.of)
-    carried, kept, h = np.empty(len(held), HELD), 0, 0
+    turns, scratch = np.empty(len(holds), np.int64), np.empty(confirming.of)
+    carried, n_carried, h = np.empty(len(carry), HELD), 0, 0
     for s in range(S):
-        _sort_by_episode(s, lists, stays, episode, first, row, number)
+        _sort_by_episode(s, lists, episodes, episode, first, row, number)
         for m in range(M):
             n = 0
-            while h < len(held) and held[h].run_ix == s and held[h].episode_ix == m:
-                used[n] = held[h].turn
-                holds[used[n]] = held[h].existence
+            while h < len(carry) and carry[h].run_ix == s and carry[h].episode_ix == m:
+                turns[n] = carry[h].turn
+                holds[turns[n]] = carry[h].existence
                 n += 1
                 h += 1
             rows, numbers = row[first[m] : first[m + 1]], number[first[m] : first[m + 1]]
             n = _take_in(
-                s, rows, numbers, lists, stays.not_before_s[m], origins, confirming, best[s, m : m + 1], holds, used, n,
-                within, level, by_list,
+                s, rows, numbers, lists, episodes.not_before_s[m], origins, confirming, best[s, m : m + 1], holds,
+                turns, n, scratch, level, by_list,
             )  # fmt: skip
-            if kept + n > len(carried):
-                grown = np.empty(2 * (kept + n), HELD)
-                for c in range(kept):
+            if n_carried + n > len(carried):
+                grown = np.empty(2 * (n_carried + n), HELD)
+                for c in range(n_carried):
                     grown[c] = carried[c]
                 carried = grown
-            for c in used[:n]:
+            for c in turns[:n]:
                 if holds[c] > best[s, m]:
-                    record = carried[kept]
+                    record = carried[n_carried]
                     record.run_ix, record.episode_ix, record.turn, record.existence = s, m, c, holds[c]
-                    kept += 1
+                    n_carried += 1
                 holds[c] = -np.inf
-    return carried[:kept].copy()
+    return carried[:n_carried].copy()
 
 
 @borrowing
 def _take_in(
     s: int, rows: Int, numbers: Int, lists: MatchedLists, not_before_s: float, origins: Origins,
-    confirming: Confirming, best: Float, holds: Float, used: Int, n: int, within: Float, level: Float, by_list: Int,
+    confirming: Confirming, best: Float, holds: Float, turns: Int, n: int, scratch: Float, level: Float, by_list: Int,
 ) -> int:  # fmt: skip
-    # Takes in the entries about one object, list by list; `best (1,)`. The number of turns that are `used` then.
+    # Takes in the entries about one object, list by list; `best (1,)`. Returns how many `turns` are open.
     place = 0
     while place < len(rows):
         k, standing, reached, newest = numbers[place], rows[place], best[0], -1
@@ -137,10 +136,10 @@ def _take_in(
                     if existence <= max(holds[c], best[0]):
                         continue
                     if holds[c] == -np.inf:
-                        used[n] = c
+                        turns[n] = c
                         n += 1
                     holds[c] = existence
-                    reached = max(reached, _find_confirming_existence(holds, c, confirming, within))
+                    reached = max(reached, _find_confirming_existence(holds, c, confirming, scratch))
         if reached > best[0]:
             best[0] = level[standing] = reached
             by_list[standing] = newest
@@ -158,12 +157,12 @@ def _is_newer(holdings: Holdings, a: int, b: int) -> bool:
 
 @callee
 def _sort_by_episode(
-    s: int, lists: MatchedLists, stays: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
+    s: int, lists: MatchedLists, episodes: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
 ) -> None:
     # Out: the entries of run s that count, episode by episode and in each list by list: `row`, and `number` of the
     # list.
     start, object_ix, role, issue_s = lists.start[s], lists.object_ix, lists.role, lists.issue_s
-    episode_of, until_s = stays.episode_of, stays.until_s
+    episode_of, until_s = episodes.episode_of, episodes.until_s
     first[:] = 0
     for k in range(len(issue_s)):
         for i in range(start[k], start[k + 1]):
@@ -190,22 +189,22 @@ def _sort_by_episode(
 
 
 @borrowing
-def _find_confirming_existence(existence: Float, turn: int, confirming: Confirming, held: Float) -> float:
-    # The highest existence with which `hits` of `of` consecutive turns of a group, this one among them, hold the
-    # object.
-    highest, hits, of, group = -np.inf, confirming.hits, confirming.of, confirming.group
-    for first in range(max(turn - of + 1, 0), turn + 1):
+def _find_confirming_existence(existence: Float, turn: int, confirming: Confirming, scratch: Float) -> float:
+    # The highest existence with which `hits` of `window` consecutive turns of a group, this one among them, hold
+    # the object.
+    highest, hits, window, group = -np.inf, confirming.hits, confirming.of, confirming.group
+    for first in range(max(turn - window + 1, 0), turn + 1):
         n = 0
-        for q in range(first, min(first + of, len(existence))):
+        for q in range(first, min(first + window, len(existence))):
             if group[q] == group[turn] and existence[q] > -np.inf:
                 place = n
-                while place > 0 and held[place - 1] > existence[q]:  # ascending
-                    held[place] = held[place - 1]
+                while place > 0 and scratch[place - 1] > existence[q]:  # ascending
+                    scratch[place] = scratch[place - 1]
                     place -= 1
-                held[place] = existence[q]
+                scratch[place] = existence[q]
                 n += 1
         if n >= hits:
-            highest = max(highest, held[n - hits])
+            highest = max(highest, scratch[n - hits])
     return highest
 
 

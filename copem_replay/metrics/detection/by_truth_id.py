@@ -87,13 +87,13 @@ def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
     arrives_s = received.common_arrives_s
     rows = np.flatnonzero((episode >= 0) & np.isfinite(arrives_s)[received.frame_ix])
     # Arrivals within a microsecond are one instant: among them the experiment's order of units decides.
-    held = np.zeros(len(arrives_s), dtype=bool)
-    held[received.frame_ix[rows]] = True
-    ordered = np.unique(arrives_s[held])
+    has_rows = np.zeros(len(arrives_s), dtype=bool)
+    has_rows[received.frame_ix[rows]] = True
+    ordered = np.unique(arrives_s[has_rows])
     instant = np.cumsum(np.diff(ordered, prepend=-np.inf) > SAME_INSTANT_S)
     place = np.zeros(len(arrives_s), dtype=np.int64)
-    place[held] = (
-        instant[np.searchsorted(ordered, arrives_s[held])] * len(received.units) + received.frame_unit_ix[held]
+    place[has_rows] = (
+        instant[np.searchsorted(ordered, arrives_s[has_rows])] * len(received.units) + received.frame_unit_ix[has_rows]
     )
     # Sorted as one number, as the rows are nearly in order.
     place_of_row = episode[rows] * ((len(ordered) + 1) * len(received.units)) + place[received.frame_ix[rows]]
@@ -123,12 +123,12 @@ class _EpisodeRows(NamedTuple):
 
 @kernel
 def _find_first(
-    rows: _ListedRows, unit_of_turn: Int, stays: _EpisodeRows, hits: int, of: int, out: FirstDetections
+    rows: _ListedRows, unit_of_turn: Int, episodes: _EpisodeRows, hits: int, window: int, out: FirstDetections
 ) -> None:
     valid, arrives_s, captured_s, entry_s, outdated_s, unit_ix, instant, turn = rows
-    order, bounds, not_before_s, until_s = stays
+    order, bounds, not_before_s, until_s = episodes
     detection_s, newest_s, first_unit_ix = out
-    held = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
+    holding = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
     no_group = np.zeros(len(unit_of_turn), dtype=np.int64)  # instants are no more than turns
     # What holds the object bears the token of the episode and run, which spares clearing them.
     by_instant, by_turn = no_group.copy(), no_group.copy()
@@ -143,13 +143,13 @@ def _find_first(
                     break
                 if not valid[s, p] or entry_s[p] < not_before_s[m]:
                     continue
-                held[n] = p
+                holding[n] = p
                 n += 1
                 if hits > 1:
                     by_instant[instant[p]] = by_turn[turn[p]] = token
                     if not (
-                        _is_confirmed(by_instant, token, instant[p], hits, of, no_group)
-                        or _is_confirmed(by_turn, token, turn[p], hits, of, unit_of_turn)
+                        _is_confirmed(by_instant, token, instant[p], hits, window, no_group)
+                        or _is_confirmed(by_turn, token, turn[p], hits, window, unit_of_turn)
                     ):
                         continue
                 # The newest list that contributes: of those that arrive at this very instant, and older ones in use.
@@ -161,7 +161,7 @@ def _find_first(
                     if valid[s, q] and _is_newer(rows, q, newest):
                         newest = q
                 for j in range(n):
-                    q = held[j]
+                    q = holding[j]
                     in_use = (
                         outdated_s[q] > arrives_s[p] + SAME_INSTANT_S or arrives_s[q] > arrives_s[p] - SAME_INSTANT_S
                     )
@@ -180,11 +180,11 @@ def _is_newer(rows: _ListedRows, p: int, q: int) -> bool:
 
 
 @callee
-def _is_confirmed(marks: Int, token: int, instant: int, hits: int, of: int, group: Int) -> bool:
-    # Whether `hits` of `of` consecutive instants or turns of one group, this one among them, hold the object.
-    for start in range(instant - of + 1, instant + 1):
+def _is_confirmed(marks: Int, token: int, instant: int, hits: int, window: int, group: Int) -> bool:
+    # Whether `hits` of `window` consecutive instants or turns of one group, this one among them, hold the object.
+    for start in range(instant - window + 1, instant + 1):
         holding = 0
-        for i in range(max(start, 0), min(start + of, len(marks))):
+        for i in range(max(start, 0), min(start + window, len(marks))):
             if marks[i] == token and group[i] == group[instant]:
                 holding += 1
         if holding >= hits:

@@ -77,13 +77,13 @@ class ConflictDetector:
         """(S, M) seconds at which such a list is available, S = 1 where one run stands for all; NaN: never."""
         issue_s = np.concatenate(self._issue_s)
         first_s = np.full((self._runs, len(self._episodes.object_ix)), np.nan)
-        hits, of = self._confirm.hits, self._confirm.of
+        hits, window = self._confirm.hits, self._confirm.of
         for (s, m), parts in self._held.items():
-            held = np.concatenate(parts)
-            # Places in `held` from which on `hits` lists are within `of` consecutive ones.
-            enough = np.flatnonzero(held[hits - 1 :] - held[: max(len(held) - hits + 1, 0)] < of)
+            list_ix = np.concatenate(parts)
+            # Places in `list_ix` from which `hits` lists are within `window` consecutive ones.
+            enough = np.flatnonzero(list_ix[hits - 1 :] - list_ix[: max(len(list_ix) - hits + 1, 0)] < window)
             if len(enough):
-                first_s[s, m] = issue_s[held[enough[0] + hits - 1]]
+                first_s[s, m] = issue_s[list_ix[enough[0] + hits - 1]]
         return first_s
 
 
@@ -188,12 +188,12 @@ def will_enter(
         else:
             reach = width + s * piece[3] + c * piece[4]
         reach /= 2
-        apart, speed = ax * dx + ay * dy, ax * vx + ay * vy
+        along, speed = ax * dx + ay * dy, ax * vx + ay * vy
         if abs(speed) < 1e-12:
-            if abs(apart) > reach:
+            if abs(along) > reach:
                 return False
             continue
-        t0, t1 = (-reach - apart) / speed, (reach - apart) / speed
+        t0, t1 = (-reach - along) / speed, (reach - along) / speed
         first, last = max(first, min(t0, t1)), min(last, max(t0, t1))
         if first > last:
             return False
@@ -213,46 +213,46 @@ def keep_episodes_within(
 
     Raises ExperimentError where the condition needs the path of an ego and there is none.
     """
-    within = experiment.measure.objects.within
-    if within is None:
+    condition = experiment.measure.objects.within
+    if condition is None:
         return episodes, np.empty(0, dtype=np.int64)
-    if within.of_ego and scene.ego_ix < 0:
+    if condition.of_ego and scene.ego_ix < 0:
         raise ExperimentError(f"{scene.log}: measure.objects.within: no ego in this study, and so no path of it")
-    decide = _is_within_at_onset if within.conflict_s is None else _will_conflict
-    kept = decide(scene, truth, episodes, experiment)
-    return episodes.take(kept), np.setdiff1d(episodes.object_ix, episodes.object_ix[kept])
+    decide = _is_within_at_onset if condition.conflict_s is None else _will_conflict
+    is_kept = decide(scene, truth, episodes, experiment)
+    return episodes.take(is_kept), np.setdiff1d(episodes.object_ix, episodes.object_ix[is_kept])
 
 
-def describe_excluded(within: Within) -> str:
+def describe_excluded(condition: Within) -> str:
     """Where the excluded objects are, for a note."""
-    if within.polygon_m is not None:
+    if condition.polygon_m is not None:
         return "outside the polygon at their onset"
-    if within.areas is not None:
-        return f"outside {', '.join(within.areas)} at their onset"
-    if within.lanes is not None:
-        return f"outside the lanes {', '.join(within.lanes)} at their onset"
-    if within.corridor_m is not None:
-        return f"more than {within.corridor_m:g} m beside the ego's way ahead"
-    return f"never within {within.conflict_s:g} s of the ego's way"
+    if condition.areas is not None:
+        return f"outside {', '.join(condition.areas)} at their onset"
+    if condition.lanes is not None:
+        return f"outside the lanes {', '.join(condition.lanes)} at their onset"
+    if condition.corridor_m is not None:
+        return f"more than {condition.corridor_m:g} m beside the ego's way ahead"
+    return f"never within {condition.conflict_s:g} s of the ego's way"
 
 
 def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> Bool:
     """(M,) whether the centre is in the polygon or corridor at the onset; False in a gap of the truth."""
-    within = experiment.measure.objects.within
-    assert within is not None
+    condition = experiment.measure.objects.within
+    assert condition is not None
     state, present = interpolate_states(
         truth, episodes.object_ix, episodes.onset_s, t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s
     )  # fmt: skip
     x_m, y_m = state["x_m"], state["y_m"]
-    if within.polygon_m is not None:
-        return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(within.polygon_m), np.inf)
-    if within.areas is not None:
-        return present & are_in_areas(x_m, y_m, scene, within.areas, experiment)
-    if within.lanes is not None:
-        return present & are_in_named(x_m, y_m, scene.lanes, within.lanes)
-    assert within.corridor_m is not None
+    if condition.polygon_m is not None:
+        return present & are_in_area(x_m, y_m, x_m, y_m, polygon_corners(condition.polygon_m), np.inf)
+    if condition.areas is not None:
+        return present & are_in_areas(x_m, y_m, scene, condition.areas, experiment)
+    if condition.lanes is not None:
+        return present & are_in_named(x_m, y_m, scene.lanes, condition.lanes)
+    assert condition.corridor_m is not None
     beside_m = _distance_to_path_m(EgoPath(scene, truth, experiment.max_gap_s), x_m, y_m, episodes)
-    near: Bool = present & (beside_m <= within.corridor_m + _TOLERANCE_M)
+    near: Bool = present & (beside_m <= condition.corridor_m + _TOLERANCE_M)
     return near
 
 
@@ -272,21 +272,21 @@ def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes
 
 def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> Bool:
     """(M,) whether at any frame the object, at constant velocity, would within `conflict_s` enter the corridor."""
-    within, measure = experiment.measure.objects.within, experiment.measure
-    assert within is not None
-    assert within.conflict_s is not None
+    condition, measure = experiment.measure.objects.within, experiment.measure
+    assert condition is not None
+    assert condition.conflict_s is not None
     margin_m = (measure.conflict or Conflict()).margin_m
     ego = EgoPath(scene, truth, experiment.max_gap_s)
     tracks = truth.take_tracks(np.isin(truth.object_ix, episodes.object_ix))
-    implied = find_conflicts(tracks, ego, Conflict(horizon_s=within.conflict_s, margin_m=margin_m))[0]
+    implied = find_conflicts(tracks, ego, Conflict(horizon_s=condition.conflict_s, margin_m=margin_m))[0]
     parts = []
-    for _, one in episodes.passes:
+    for _, part in episodes.passes:
         episode_of = np.full(len(scene.object_ids), -1)
-        episode_of[one.object_ix] = np.arange(len(one.object_ix))
+        episode_of[part.object_ix] = np.arange(len(part.object_ix))
         rows = np.flatnonzero(implied & (episode_of[tracks.row_object_ix] >= 0))
         episode, time_s = episode_of[tracks.row_object_ix[rows]], tracks.row_captured_s[rows]
-        during = (time_s >= one.onset_s[episode] - SAME_INSTANT_S) & (time_s <= one.ended_s[episode] + SAME_INSTANT_S)
-        kept = np.zeros(len(one.object_ix), dtype=bool)
-        kept[episode[during]] = True
-        parts.append(kept)
+        during = (time_s >= part.onset_s[episode] - SAME_INSTANT_S) & (time_s <= part.ended_s[episode] + SAME_INSTANT_S)
+        is_kept = np.zeros(len(part.object_ix), dtype=bool)
+        is_kept[episode[during]] = True
+        parts.append(is_kept)
     return episodes.join_passes(parts)

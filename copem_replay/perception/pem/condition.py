@@ -37,13 +37,13 @@ def noise_quantity(noise: str) -> str:
     return "size" if first in _OF_SIZE else first
 
 
-def check_quantities(memory: Mapping[str, Parts], asked: frozenset[str] | None, owner: str) -> None:
-    """Raise pydantic's ValidationError, at their names, for quantities that nothing draws; `asked` None: not known."""
-    if asked is None:
+def check_quantities(memory: Mapping[str, Parts], noise_names: frozenset[str] | None, owner: str) -> None:
+    """Raise pydantic's ValidationError for quantities in `memory` that nothing draws; `noise_names` None: unknown."""
+    if noise_names is None:
         return
-    drawn = ", ".join(sorted(asked)) or "none"
+    drawn = ", ".join(sorted(noise_names)) or "none"
     problems = []
-    for name in memory.keys() - asked - set(QUANTITIES):
+    for name in memory.keys() - noise_names - set(QUANTITIES):
         message = f'no model of this {owner} asks for noise "{name}" (they ask for {drawn})'
         kind = PydanticCustomError("memory", "{m}", {"m": message})
         problems.append(InitErrorDetails(type=kind, loc=("memory", name), input=name))

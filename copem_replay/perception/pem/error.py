@@ -76,18 +76,18 @@ def ask_errors(model: ErrorModel, view: ViewGeometry, noise: Noise, runs: int, w
 
 
 def find_noise_names(model: ErrorModel) -> frozenset[str] | None:
-    """The names by which a model asks for noise, when it is asked about no rows; None where it fails at that."""
-    asked: set[str] = set()
+    """The names of the noise that a model requests, tried with no rows; None where the model fails at that."""
+    names: set[str] = set()
 
     def noise(name: str) -> Float:
-        asked.add(name)
+        names.add(name)
         return np.zeros((1, 0))
 
     try:
         model.perturb(ViewGeometry(*np.zeros((len(fields(ViewGeometry)), 0))), noise)
     except FAILURES:  # a user's own may not expect to be asked about none
         return None
-    return frozenset(asked)
+    return frozenset(names)
 
 
 class _Covariant(ErrorModel):

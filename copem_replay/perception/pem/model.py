@@ -94,12 +94,12 @@ def class_row(shares: dict[str, float]) -> Float:
     return np.array([shares.get(name, 0.0) for name in CLASSES])
 
 
-def draw_classes(rows: Float, which: Int, uniform: Float) -> Int:
-    """(P,) a class for each uniform (P,), by row `which` (P,) of probabilities (R, C)."""
+def draw_classes(rows: Float, row_ix: Int, uniform: Float) -> Int:
+    """(P,) a class for each uniform (P,), by row `row_ix` (P,) of probabilities (R, C)."""
     cumulated = np.cumsum(rows, axis=1)
     cumulated[:, -1] = 1.0
     last = np.array([np.flatnonzero(row)[-1] for row in rows])  # rounding gives no share to a class of probability 0
-    listed: Int = np.minimum((uniform[:, None] >= cumulated[which]).sum(axis=1), last[which])
+    listed: Int = np.minimum((uniform[:, None] >= cumulated[row_ix]).sum(axis=1), last[row_ix])
     return listed
 
 
@@ -115,7 +115,7 @@ class GhostPlace(Component, ABC):
 
     @abstractmethod
     def places_m(self, uniform: Float, length_m: Float, width_m: Float) -> Float:
-        """(2, B) where ghosts are in the frame, ahead and to the left (of the world: east and north).
+        """(2, B) places of ghosts in the frame, ahead and to the left (of the world: east and north).
 
         `uniform` (3, B): of each ghost three, in (0, 1). `length_m`, `width_m` (B,): of the object beside which it is.
         """
@@ -166,13 +166,13 @@ class AreaPlace(GhostPlace):
     _polygons_m: tuple[Rings, ...] = PrivateAttr(())  # of the log, set by `over`
 
     def over(self, polygons_m: Iterable[Rings]) -> Self:
-        """The same with the polygons of its areas."""
+        """The place with the polygons of its areas."""
         copy = self.model_copy()
         copy._polygons_m = tuple(polygons_m)
         return copy
 
     def places_m(self, uniform: Float, length_m: Float, width_m: Float) -> Float:
-        """In a triangle that the third number chooses by its size, at a place that the two others choose."""
+        """Places in a triangle chosen by area with the third number, at a point chosen by the two others."""
         corners_m, until = _cut_into_triangles(self._polygons_m)
         a, b, c = corners_m[:, :, np.searchsorted(until, uniform[2])]
         far = np.sqrt(uniform[0])
@@ -292,14 +292,14 @@ class Pem(Frozen):
         return {"anyOf": [handler.resolve_ref_schema(schema)["properties"]["couples"], schema]}
 
     def asked(self) -> frozenset[str] | None:
-        """The quantities that its error models draw; None where one of the user's own does not say."""
+        """The quantities that its error models draw; None where a user's own model does not say."""
         by_couple = [couple.asked() for couple in self.couples]
         return (
             None if None in by_couple else frozenset[str]().union(*(names for names in by_couple if names is not None))
         )
 
     def memory_of(self, couple: int) -> Mapping[str, Parts]:
-        """The draws of a couple that last: its own `memory`, or else that of the PEM."""
+        """The memory of a couple's draws: its own `memory`, or else that of the PEM."""
         own = self.couples[couple].memory
         return self.memory if own is None else own
 
@@ -325,10 +325,10 @@ class Pem(Frozen):
 
     def in_vain(self) -> Iterator[str]:
         """Quantities in `memory` that no couple draws."""
-        asked = self.asked()
-        drawn = {"detection", *(asked or ())}
+        noise_names = self.asked()
+        drawn = {"detection", *(noise_names or ())}
         drawn |= {"class"} if self.classes is not None and self.classes.confusion else set()
         drawn |= {"existence"} if self._scores else set()
-        for name in self.memory if asked is not None else ():
+        for name in self.memory if noise_names is not None else ():
             if name not in drawn:
                 yield name

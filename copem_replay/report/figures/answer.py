@@ -98,7 +98,7 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
     weigh = results.experiment.measure.weigh
     clusters = find_clusters(results.known, weigh=weigh)
     dots: list[Dot] = []
-    without: dict[str, list[str]] = {}
+    unlimited: dict[str, list[str]] = {}
     for name in names:
         mean_s, horizon_s = (float(rows.loc[name, key]) for key in (RANKED_BY, "ttd_rmst_horizon_s"))
         if np.isnan(mean_s):
@@ -107,22 +107,22 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         if rows.loc[name, "detected_share"] == 0:
             dots.append(Dot(None, None, None, f"never (counts as {format_three_digits(horizon_s)} s)"))
             continue
-        found = None
+        limit = None
         reason = explain_no_intervals(results) if clusters is None else "every run is the same"
         if clusters is not None and not (clusters.by_run and results.facts[name].fixed):
-            kept = (results.known["configuration"] == name).to_numpy()
-            of_name = results.known[kept]
+            mask = (results.known["configuration"] == name).to_numpy()
+            of_name = results.known[mask]
             weight, least_s = weigh_rows(of_name, "runs", weigh), results.facts[name].least_s
-            rows_of_name = FigureRows(of_name, weight, clusters.select(kept), least_s=least_s)
-            found = rows_of_name.limit_mean_time(horizon_s, CONFIDENCE)
-            reason = f"all {clusters.over} alike" if found.kind == ALL_ALIKE else "no object is followed to the horizon"
-        if found is None or np.isnan(found.low):
-            without.setdefault(reason, []).append(name)
+            rows_of_name = FigureRows(of_name, weight, clusters.select(mask), least_s=least_s)
+            limit = rows_of_name.limit_mean_time(horizon_s, CONFIDENCE)
+            reason = f"all {clusters.over} alike" if limit.kind == ALL_ALIKE else "no object is followed to the horizon"
+        if limit is None or np.isnan(limit.low):
+            unlimited.setdefault(reason, []).append(name)
             dots.append(Dot(mean_s, None, None, format_two_decimals(mean_s)))
         else:
-            words = f"{format_two_decimals(mean_s)} {write_limits(found.low, found.high)}"
-            dots.append(Dot(mean_s, found.low, found.high, words))
-    return dots, [_explain_without(reason, lacking, names) for reason, lacking in without.items()]
+            words = f"{format_two_decimals(mean_s)} {write_limits(limit.low, limit.high)}"
+            dots.append(Dot(mean_s, limit.low, limit.high, words))
+    return dots, [_explain_without(reason, lacking, names) for reason, lacking in unlimited.items()]
 
 
 def _explain_without(reason: str, lacking: Sequence[str], names: Sequence[str]) -> str:

@@ -80,8 +80,8 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
     Up to `TOGETHER` in one panel with 95 % bands; more in a panel each, with the baseline in all of them, without
     bands. With exact curves if the results have them.
     """
-    chosen = results.chosen(configurations)
-    names = find_differing(results, chosen)
+    selected = results.chosen(configurations)
+    names = find_differing(results, selected)
     over, curves = build_curves(results, names, bands=len(names) <= TOGETHER)
     counted = None if results.exact is None else results.counted(results.exact)
     weigh = results.experiment.measure.weigh
@@ -92,14 +92,14 @@ def curves_figure(results: Results, *, configurations: Sequence[str] | None = No
             figure = _draw_together(curves, exact, looks, limits_s)
         else:
             figure = _draw_apart(curves, exact, looks, limits_s, find_baseline(results.facts, names).name)
-        _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(chosen, names))
+        _add_caption(figure, results, names, over, curves, bool(exact), describe_left_out(selected, names))
         return figure
 
 
 def build_curves(
     results: Results, names: Sequence[str], *, bands: bool = True
 ) -> tuple[str | None, dict[str, DetectionCurve]]:
-    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands if there are clusters."""
+    """The kind of clusters (None, or `NOTHING_DRAWN`), and the curves, with bands where there are clusters."""
     weigh = results.experiment.measure.weigh
     clusters = find_clusters(results.known, weigh=weigh)
     fixed = [name for name in names if clusters is not None and clusters.by_run and results.facts[name].fixed]
@@ -270,7 +270,7 @@ def _add_caption(
     over: str | None,
     curves: dict[str, DetectionCurve],
     exact: bool,
-    left: str,
+    omitted: str,
 ) -> None:
     bands = ""
     if over is None:
@@ -282,17 +282,17 @@ def _add_caption(
     else:
         bands = f"Bands: 95 %, over {describe_over(results)}"
     end_s = figure.axes[0].get_xlim()[1]
-    later = max((curve.last - _evaluate_share(curve, end_s) for curve in curves.values()), default=0.0)
+    beyond = max((curve.last - _evaluate_share(curve, end_s) for curve in curves.values()), default=0.0)
     add_note(
         figure,
         [
-            left,
+            omitted,
             describe_results(results, names),
             describe_list_rates(results.summary, names),
             "What departs undetected is never known (Aalen–Johansen, departure competing)",
             bands,
             "Dashed: the exact share" if exact else "",
-            f"Beyond the axis at most {math.ceil(1000 * later) / 10:g} % more are detected" if later > 0 else "",
+            f"Beyond the axis at most {math.ceil(1000 * beyond) / 10:g} % more are detected" if beyond > 0 else "",
         ],
     )
 

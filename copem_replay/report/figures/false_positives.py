@@ -56,8 +56,8 @@ def _contenders_with_both(results: Results, names: Sequence[str]) -> list[str]:
 
 def false_positives_figure(results: Results, *, configurations: Sequence[str] | None = None) -> Figure:
     """False positives per minute over the position error (RMSE) of each configuration; lower left is better."""
-    asked = results.chosen(configurations)
-    names = _contenders_with_both(results, asked)
+    selected = results.chosen(configurations)
+    names = _contenders_with_both(results, selected)
     rows = results.summary.set_index("configuration")
     error_m, rate = (rows.loc[names, key].to_numpy(dtype=float) for key in (_ERROR, _FALSE))
     looks, short = choose_appearances(results), shorten_names(names)
@@ -74,13 +74,13 @@ def false_positives_figure(results: Results, *, configurations: Sequence[str] | 
                 )  # fmt: skip
         axes.set_xlabel("Position error, RMSE (m)")
         axes.set_ylabel("False positives per minute")
-        left = [short_name for name, short_name in shorten_names(asked).items() if name not in names]
+        rest = [short_name for name, short_name in shorten_names(selected).items() if name not in names]
         add_note(
             figure,
             [
                 describe_results(results, names),
                 "Better towards the lower left. Without intervals: those of the differences are in the table",
-                f"Not drawn, for they have no such metrics or are the ground truth: {', '.join(left)}" if left else "",
+                f"Not drawn, for they have no such metrics or are the ground truth: {', '.join(rest)}" if rest else "",
             ],
         )
         number_marks(figure, axes, [short[name] for name in names], _MARK_PT)

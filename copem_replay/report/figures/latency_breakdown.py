@@ -146,10 +146,8 @@ def latency_breakdown_figure(results: Results, *, configurations: Sequence[str] 
 
 def _draw_bar(axes: Axes, place: int, means: dict[str, float], colour: tuple[float, float, float]) -> None:
     """Draw the stages of one configuration in a row, after a tick of its colour."""
-    beside: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False, "label": "_colour"}
-    axes.plot(
-        [-0.008, -0.008], [place - 0.35, place + 0.35], color=colour, linewidth=5, solid_capstyle="butt", **beside
-    )
+    style: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "clip_on": False, "label": "_colour"}
+    axes.plot([-0.008, -0.008], [place - 0.35, place + 0.35], color=colour, linewidth=5, solid_capstyle="butt", **style)
     begin_s = 0.0
     for stage, mean_s in ((stage, means[stage]) for stage in STAGES if stage in means):
         fill, hatch, ink = HATCHES[stage]

@@ -65,13 +65,13 @@ class Drive:
         yield from (np.array(solid.corners_m) for solid in self.scene.solids)
 
     def lanes_within(self, west_m: float, east_m: float, south_m: float, north_m: float) -> list[Float]:
-        """Borders of lanes (K, 2) that come into a box."""
+        """Borders of lanes (K, 2) that reach into a box."""
         borders = (line[:, :2] for line in self.lanes_m)
         low, high = (west_m, south_m), (east_m, north_m)
         return [line for line in borders if (line.max(axis=0) >= low).all() and (line.min(axis=0) <= high).all()]
 
     def fixed_units(self) -> dict[str, tuple[float, float]]:
-        """Places of the units that stand."""
+        """Places of the fixed units."""
         return {name: unit.at for name, unit in self.experiment.modelled.items() if unit.at is not None}
 
 
@@ -127,8 +127,8 @@ def late_paths_figure(results: Results, selection: Selection) -> Figure:
 
     A panel per configuration, the soonest first. Raises RecordingError where the recording is missing.
     """
-    asked = sort_soonest_first(results, find_contenders(results, selection.configurations))
-    names = [name for name in asked if name in find_differing(results, asked)]
+    selected = sort_soonest_first(results, find_contenders(results, selection.configurations))
+    names = [name for name in selected if name in find_differing(results, selected)]
     drive = read_drive(results, selection.log or find_latest_log(results))
     rows = average_unknown(results, names)
     rows = rows[rows["log"] == drive.log]
@@ -140,7 +140,7 @@ def late_paths_figure(results: Results, selection: Selection) -> Figure:
     tall_in = wide_in * (box[3] - box[2]) / (box[1] - box[0])
     with figure_style():
         figure = new_figure(columns * wide_in + 1.0, lines * (tall_in + 0.3) + 0.7)
-        below_in = add_note(figure, _note_sentences(results, drive, rows, names, asked))
+        below_in = add_note(figure, _note_sentences(results, drive, rows, names, selected))
         figure.set_layout_engine("none")  # panels have a place already, which takes half of the time
         width_in, height_in = (float(size) for size in figure.get_size_inches())
         figure.set_size_inches(width_in, height_in - 0.65 + below_in)
@@ -236,20 +236,20 @@ def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> 
 
 
 def _note_sentences(
-    results: Results, drive: Drive, rows: pd.DataFrame, names: Sequence[str], asked: Sequence[str]
+    results: Results, drive: Drive, rows: pd.DataFrame, names: Sequence[str], selected: Sequence[str]
 ) -> list[str]:
     logs, runs = len(results.provenance.logs), results.experiment.runs
-    which = f"{drive.log}, the drive of {logs} on which objects stay unknown longest" if logs > 1 else drive.log
+    drive_words = f"{drive.log}, the drive of {logs} on which objects stay unknown longest" if logs > 1 else drive.log
     never = (
         f"; ✕: never known in {100 * NEVER_FROM:.0f} % of the {runs} runs or more" if runs > 1 else "; ✕: never known"
     )
     north = ", north is up" if drive.scene.frame is not None and not drive.scene.frame.yaw_rad else ""
     return [
-        f"{which}: {count_noun(rows['object_id'].nunique(), 'measured object')}{north}",
+        f"{drive_words}: {count_noun(rows['object_id'].nunique(), 'measured object')}{north}",
         "Grey: before it counts; thick: unknown from then on; thin: afterwards, in the colour of the time that it "
         f"took; darker is later{never}",
         *(["Dashed: the way of the ego"] if drive.scene.ego_ix >= 0 else []),
         *(["Triangles: fixed units"] if drive.fixed_units() else []),
         *(f"Map: {line}" for line in drive.credits),
-        describe_left_out(asked, names),
+        describe_left_out(selected, names),
     ]

@@ -51,10 +51,10 @@ class FigureKind:
     about: Callable[[Results], Sequence[str]] = lambda results: ()
 
 
-def _draw_runs(results: Results, of: Selection) -> Figure:
+def _draw_runs(results: Results, selection: Selection) -> Figure:
     from copem_replay.report.figures.single_runs import runs_figure
 
-    return runs_figure(results, of)
+    return runs_figure(results, selection)
 
 
 def _no_differences(results: Results, selection: Selection) -> str | None:

@@ -123,21 +123,21 @@ def _find_most_telling(results: Results, of_run: pd.DataFrame) -> tuple[str, str
 
     Where the recording cannot be read, how near the ego's path an object is does not decide.
     """
-    apart = {
+    ranking = {
         log: measure_apart(resolve_for_log(results.experiment, log), rows).sort_values(
             ["observed", "apart_s", "apart_raw_s"], ascending=False, kind="stable"
         )
         for log, rows in of_run.groupby("log", sort=False)
     }
-    log = max(apart, key=lambda name: tuple(apart[name][["observed", "apart_s"]].iloc[0]))
-    first, asked = str(apart[log].index[0]), resolve_for_log(results.experiment, log)
-    if len(apart[log]) == 1:
+    log = max(ranking, key=lambda name: tuple(ranking[name][["observed", "apart_s"]].iloc[0]))
+    first, experiment = str(ranking[log].index[0]), resolve_for_log(results.experiment, log)
+    if len(ranking[log]) == 1:
         return log, first
     try:
-        recording = results.recording(log, asked)
+        recording = results.recording(log, experiment)
     except CopemError:
         return log, first
-    shown = choose_shown_objects(recording.scene, recording.truth, asked, of_run[of_run["log"] == log])
+    shown = choose_shown_objects(recording.scene, recording.truth, experiment, of_run[of_run["log"] == log])
     return log, recording.scene.object_ids[shown.object_ix[0]]
 
 
@@ -173,7 +173,7 @@ def pivot_by_run(results: Results, column: str) -> Iterator[pd.DataFrame]:
 
 
 def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
-    """A sentence on the configurations that a figure leaves out; empty without any."""
+    """A sentence on the configurations that a figure omits; empty without any."""
     left = [short for name, short in shorten_names(names).items() if name not in shown]
     if not left:
         return ""

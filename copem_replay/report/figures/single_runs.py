@@ -303,13 +303,13 @@ def runs_figure(results: Results, selection: Selection) -> Figure:
     (rows,) = results.each(log=choice.log, every=True)
     of_run = first_episodes(rows[(rows["object_id"] == choice.object_id) & (rows["run"] == choice.run)])
     of_run = of_run.set_index("configuration", drop=False)
-    alike = not replay.encounters or results.experiment.braking is None
-    if alike and not choice.named:
+    is_shared = not replay.encounters or results.experiment.braking is None
+    if is_shared and not choice.named:
         present = [name for name in results.chosen(None) if name in of_run.index]
         choice = replace(choice, configurations=find_differing(results, present))
     stories = [tell_story(replay, results.experiment, of_run.loc[name]) for name in choice.configurations]
     with figure_style():
-        figure = (_draw_together if alike else _draw_stories)(results, replay, stories)
+        figure = (_draw_together if is_shared else _draw_stories)(results, replay, stories)
         add_note(figure, _note_sentences(results, choice, stories))
     return figure
 
@@ -416,10 +416,10 @@ def _draw_courses(
     """Draw speed and distance at instants (T,) since the onset: with braking thick, without thin; else as recorded."""
     experiment, time_s = results.experiment, since_s + story.onset_s
     free = free_course(replay, experiment.max_gap_s, story.object_ix, story.encounter, time_s)
-    own = look.line(2.2) | {"linestyle": "-"}
+    style = look.line(2.2) | {"linestyle": "-"}
     if story.encounter is None or experiment.braking is None:
-        speed.plot(since_s, free.speed_mps, label="as recorded", **own)
-        gap.plot(since_s, free.gap_m, label="as recorded", **own)
+        speed.plot(since_s, free.speed_mps, label="as recorded", **style)
+        gap.plot(since_s, free.gap_m, label="as recorded", **style)
         return
     course = braked_course(story.encounter, experiment.braking.driver, story.brake_s, time_s)
     braking = time_s <= story.impact_s
@@ -427,7 +427,7 @@ def _draw_courses(
     for axes, thin, thick in ((speed, free.speed_mps, course.speed_mps), (gap, free.gap_m, course.gap_m)):
         axes.plot(since_s, thin, color=FAINT, linewidth=1.0, label="does not brake")
         drawn = np.where(since_s < 0, thin, thick)[braking]  # until the onset the ego does not brake
-        axes.plot(since_s[braking], drawn, label="brakes", **own)
+        axes.plot(since_s[braking], drawn, label="brakes", **style)
         if np.isfinite(story.impact_s):
             axes.plot(since_s[braking][-1:], drawn[-1:], "X", color=INK, markersize=6, label="hits")
 

@@ -239,15 +239,15 @@ def number_marks(figure: Figure, axes: Axes, names: Sequence[str], mark_pt: floa
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)  # places of marks in points depend on it
-    at = [tuple(np.asarray(mark.get_offsets())[0].tolist()) for mark in axes.collections]
-    places = [axes.transData.transform(place) * 72 / figure.dpi for place in at]
+    offsets = [tuple(np.asarray(mark.get_offsets())[0].tolist()) for mark in axes.collections]
+    places = [axes.transData.transform(place) * 72 / figure.dpi for place in offsets]
     groups: list[list[int]] = []
     for k, place in enumerate(places):
         near = (group for group in groups if any(math.dist(places[other], place) < mark_pt for other in group))
         group = next(near, None)
         groups.append([k]) if group is None else group.append(k)
     left, bottom, right, _ = (72 / figure.dpi * edge for edge in axes.get_window_extent().extents)
-    taken = [((left + right) / 2, bottom, right - left, 1.0), *((*place, mark_pt, mark_pt) for place in places)]
+    covered = [((left + right) / 2, bottom, right - left, 1.0), *((*place, mark_pt, mark_pt) for place in places)]
     for group in groups:
         text = ", ".join(str(k + 1) for k in group)
         wide, high = 0.58 * _NUMBER_PT * len(text), _NUMBER_PT
@@ -256,18 +256,18 @@ def number_marks(figure: Figure, axes: Axes, names: Sequence[str], mark_pt: floa
             for x, y in _BESIDE
             for k in group
         ]
-        spot = min(spots, key=lambda one: sum(_overlap(one, other) for other in taken))
-        taken.append(spot)
+        spot = min(spots, key=lambda box: sum(_overlap(box, other) for other in covered))
+        covered.append(spot)
         axes.annotate(
-            text, at[group[0]], xytext=tuple(np.subtract(spot[:2], places[group[0]])),
+            text, offsets[group[0]], xytext=tuple(np.subtract(spot[:2], places[group[0]])),
             textcoords="offset points", ha="center", va="center", fontsize=_NUMBER_PT, color=INK, annotation_clip=False,
         )  # fmt: skip
 
 
-def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+def _overlap(box_a: tuple[float, ...], box_b: tuple[float, ...]) -> float:
     """Area common to two boxes, each by its middle, width and height."""
-    wide = min((one[2] + other[2]) / 2 - abs(one[0] - other[0]), one[2], other[2])
-    high = min((one[3] + other[3]) / 2 - abs(one[1] - other[1]), one[3], other[3])
+    wide = min((box_a[2] + box_b[2]) / 2 - abs(box_a[0] - box_b[0]), box_a[2], box_b[2])
+    high = min((box_a[3] + box_b[3]) / 2 - abs(box_a[1] - box_b[1]), box_a[3], box_b[3])
     return max(wide, 0.0) * max(high, 0.0)
 
 
@@ -276,7 +276,7 @@ _NOTE = "note"
 
 
 def take_note(figure: Figure) -> str:
-    """Take the note from a figure, with the space it was in: a page has it as a text of its own. Empty without one."""
+    """Take the note and its space away from a figure, as a page shows it as text. Empty without one."""
     from matplotlib.layout_engine import PlaceHolderLayoutEngine
 
     notes = [text for text in figure.texts if text.get_gid() == _NOTE]
@@ -308,13 +308,13 @@ def shorten_names(names: Sequence[str]) -> dict[str, str]:
 def describe_results(results: Results, names: Sequence[str]) -> str:
     """Runs, objects, logs, rows per configuration and seed of the results, in words."""
     counted = results.known[results.known["configuration"].isin(list(names))]
-    things = counted.groupby(["log", "object_id"]).ngroups
+    objects = counted.groupby(["log", "object_id"]).ngroups
     logs, episodes = counted["log"].nunique(), counted.groupby(["log", "object_id", "episode"]).ngroups
-    times = f" ({count_noun(episodes, 'episode')})" if episodes > things else ""
+    times = f" ({count_noun(episodes, 'episode')})" if episodes > objects else ""
     in_logs = f" in {count_noun(logs, 'log')}" if logs > 1 else ""
     rows = counted["runs"].sum() / max(counted["configuration"].nunique(), 1)
     return (
-        f"{count_noun(results.experiment.runs, 'run')} of {count_noun(things, 'object')}{times}{in_logs}, "
+        f"{count_noun(results.experiment.runs, 'run')} of {count_noun(objects, 'object')}{times}{in_logs}, "
         f"n = {rows:.0f} per configuration, seed {results.experiment.seed}"
     )
 
@@ -387,7 +387,7 @@ def write_limits(low: float, high: float) -> str:
 
 
 def describe_over(results: Results) -> str:
-    """What intervals of the results are over, what that tells and cannot exclude; empty where there are none."""
+    """What the intervals of results are over, what they show and cannot exclude; empty without any."""
     clusters = find_clusters(results.known)
     if clusters is None:
         return ""
@@ -412,7 +412,7 @@ METADATA = {
 
 
 def render_figure(figure: Figure, suffixes: Sequence[str] = tuple(METADATA)) -> dict[str, bytes]:
-    """The content of a file of each kind."""
+    """The content of one file per kind."""
     content = {}
     with figure_style(), warnings.catch_warnings():
         warnings.filterwarnings(
@@ -474,7 +474,7 @@ def find_truths(results: Results) -> tuple[str, ...]:
 
 
 def find_contenders(results: Results, names: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Those of `names` (None: all) that are not the ground truth; all of `names` if there are no others."""
+    """The configurations of `names` (None: all) that are not the ground truth; all of `names` without any other."""
     chosen, upper = results.chosen(names), find_truths(results)
     return tuple(name for name in chosen if name not in upper) or chosen
 

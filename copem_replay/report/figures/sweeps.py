@@ -69,7 +69,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
     if not kinds:
         raise InputError(f"{results.place}/sweep.csv: expected rows of {', '.join(names)}, found none")
     baseline = find_baseline(results.facts, names).name
-    asked, names = names, _find_differing(sweep, names, baseline)
+    selected, names = names, _find_differing(sweep, names, baseline)
     sweep = sweep[sweep["configuration"].isin(names)]
     rows = [name for name in _ROWS if name == "ttd" or (name in sweep and sweep[name].notna().any())]
     groups = [names] if len(names) <= TOGETHER else [(baseline, name) for name in names if name != baseline]
@@ -91,7 +91,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
         for shared in [panels[0, -1]] if len(groups) == 1 else panels[:, -1].T:
             _close_open_bands(shared)
         _add_legend(figure, panels.reshape(-1, len(kinds)), kinds, names if len(groups) == 1 else [baseline])
-        add_note(figure, [*_note_sentences(results, sweep, kinds, names), describe_left_out(asked, names)])
+        add_note(figure, [*_note_sentences(results, sweep, kinds, names), describe_left_out(selected, names)])
     return figure
 
 

@@ -48,7 +48,7 @@ def write_details(study: ReportData) -> Html:
 
 def _prevent_breaks(sentence: str) -> Html:
     """Prevent line breaks between a value and its interval, and within the interval."""
-    return Html(_INTERVAL.sub(lambda found: make_tag("span", Html(found[0]), class_="tight"), escape_text(sentence)))
+    return Html(_INTERVAL.sub(lambda match: make_tag("span", Html(match[0]), class_="tight"), escape_text(sentence)))
 
 
 def _detail_sentences(study: ReportData) -> Iterator[str]:
@@ -123,12 +123,12 @@ def _pass_sentences(study: ReportData) -> Iterator[str]:
         return
     share = judged["pass_share"].astype(float)
     best, worst = str(share.idxmax()), str(share.idxmin())
-    alike, last = ([str(name) for name in share.index[share == share[one]]] for one in (best, worst))
+    best_names, last = ([str(name) for name in share.index[share == share[one]]] for one in (best, worst))
     sentence = f"Braking in time: of {count_noun(int(judged.loc[best, 'n_conflict']), 'row')} in conflict "
-    sentence += f"{_format_share(judged.loc[best])} pass with {name_first(alike, NAMED)}"
-    if len(alike) < len(share):
+    sentence += f"{_format_share(judged.loc[best])} pass with {name_first(best_names, NAMED)}"
+    if len(best_names) < len(share):
         sentence += f", {_format_share(judged.loc[worst])} with {name_first(last, NAMED)}"
-    if study.regret is not None and study.baseline not in alike:
+    if study.regret is not None and study.baseline not in best_names:
         overall = study.regret.overall
         differences = overall[overall["metric"] == "pass_share"].set_index("configuration")
         if best in differences.index and pd.notna(differences.loc[best, "difference"]):
@@ -157,16 +157,16 @@ def _variation_sentences(study: ReportData) -> Iterator[str]:
     episode = rows.groupby(["log", "object_id", "episode"], sort=False).ngroup()
     mean_s = float(np.average(time_s, weights=weight))
     means_s = {
-        what: (time_s * weight).groupby(key).transform("sum") / weight.groupby(key).transform("sum")
-        for what, key in (("object", episode), ("configuration", rows["configuration"]))
+        kind: (time_s * weight).groupby(key).transform("sum") / weight.groupby(key).transform("sum")
+        for kind, key in (("object", episode), ("configuration", rows["configuration"]))
     }
     pairs = [episode, rows["configuration"]]
-    of_pair = (time_s * weight).groupby(pairs).transform("sum") / weight.groupby(pairs).transform("sum")
-    apart = {what: means - mean_s for what, means in means_s.items()} | {"run": time_s - of_pair}
-    sd_s = {what: float(np.sqrt(np.average(of**2, weights=weight))) for what, of in apart.items()}
-    shown = [(what, value) for what, value in sorted(sd_s.items(), key=itemgetter(1), reverse=True) if value >= 0.005]
+    pair_mean_s = (time_s * weight).groupby(pairs).transform("sum") / weight.groupby(pairs).transform("sum")
+    deviations = {kind: means - mean_s for kind, means in means_s.items()} | {"run": time_s - pair_mean_s}
+    sd_s = {kind: float(np.sqrt(np.average(of**2, weights=weight))) for kind, of in deviations.items()}
+    shown = [(kind, value) for kind, value in sorted(sd_s.items(), key=itemgetter(1), reverse=True) if value >= 0.005]
     if shown:
-        words = (f"from {what} to {what} by {format_two_decimals(value)} s" for what, value in shown)
+        words = (f"from {kind} to {kind} by {format_two_decimals(value)} s" for kind, value in shown)
         yield f"Times vary most {', then '.join(words)} (standard deviations of means)."
 
 

@@ -24,12 +24,12 @@ def escape_text(value: str) -> Html:
 
 def make_tag(name: str, *children: str, **attributes: str | bool | None) -> Html:
     """An element; `class_`, `data_value`: `class`, `data-value`. None or False: without the attribute."""
-    written = "".join(
+    text = "".join(
         f" {key.rstrip('_').replace('_', '-')}" + ("" if value is True else f'="{escape_text(value)}"')
         for key, value in attributes.items()
         if value is not None and value is not False
     )
-    return Html(f"<{name}{written}>{join_html(children)}</{name}>")
+    return Html(f"<{name}{text}>{join_html(children)}</{name}>")
 
 
 def join_html(parts: Iterable[str], between: str = "") -> Html:
@@ -130,7 +130,7 @@ def _variable(look: Appearance) -> str:
 def replace_colours(svg: str, looks: Iterable[Appearance]) -> str:
     """Colours of configurations in styles and attributes as variables; `page_colours` sets them."""
     variables = {css_colour(look.colour): _variable(look) for look in looks}
-    return _COLOUR.sub(lambda found: f"var({variables[found[0]]})" if found[0] in variables else found[0], svg)
+    return _COLOUR.sub(lambda match: f"var({variables[match[0]]})" if match[0] in variables else match[0], svg)
 
 
 # Greys of figures become variables of the page, from ink for black to paper for white, so that a dark page inverts

@@ -97,16 +97,16 @@ def check_report(path: Path) -> None:
 
 
 def write_html_report(
-    given: Path | Results, out: Path | None = None, *, baseline: str | None = None, by: Sequence[str] | None = None
+    source: Path | Results, out: Path | None = None, *, baseline: str | None = None, by: Sequence[str] | None = None
 ) -> Path:
     """Write the report of results, or of a results folder, by default as `report.html` in it. Returns its path.
 
     `by`: entries of slices, None: those of the experiment. An existing report is replaced. Raises InputError if the
     results cannot be read, OutputError if the file cannot be written.
     """
-    path = out or (given.require_folder() if isinstance(given, Results) else given) / REPORT
+    path = out or (source.require_folder() if isinstance(source, Results) else source) / REPORT
     check_report(path)
-    study = load_study(given, baseline, by)
+    study = load_study(source, baseline, by)
     html = build_page(study)
     with made_file(path, study.results.place) as scratch:
         scratch.write_text(html, encoding="utf-8", newline="\n")
@@ -201,10 +201,10 @@ def _false_sections(study: ReportData) -> Iterator[_Section]:
         return
     rows = results.frame(FALSE_TRACKS)
     rows = rows[(rows["log"] == log) & (rows["run"] == shown.get(log, 0))]
-    told = []
+    items = []
     for name in study.contenders:
         of_name = rows[rows["configuration"] == name]
-        told.append(
+        items.append(
             join_html(
                 [
                     make_tag("b", name),
@@ -215,7 +215,7 @@ def _false_sections(study: ReportData) -> Iterator[_Section]:
     if len(rows):
         where = f"run {shown.get(log, 0)} of {log}"
         words = f"Entries about nobody in {where}, the longest first. Those of all runs are in {FALSE_TRACKS}."
-        yield _Section("false-tracks", "False tracks", [make_tag("p", words), make_list(told)])
+        yield _Section("false-tracks", "False tracks", [make_tag("p", words), make_list(items)])
 
 
 def _extra_sections(study: ReportData) -> Iterator[_Section]:
@@ -240,7 +240,7 @@ def _embed_figure(study: ReportData, name: str) -> Html:
 
 
 def _embed_answer(study: ReportData) -> Html:
-    """The figure of the answer, and the same with its panels stacked, of which a screen shows what it has room for."""
+    """The figure of the answer in a wide and a stacked layout; CSS shows the one that fits the screen."""
     kind, looks = FIGURES[_ANSWER], study.looks.values()
     stacked = answer_figure(study.results, stacked=True)
     take_note(stacked)  # the other one has it
@@ -270,13 +270,13 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
         if reason is not None:
             yield _Section(f"section-{name}", kind.title, [make_tag("p", f"No figure: {reason}.")])
             continue
-        about = [make_tag("p", line) for line in kind.about(study.results)]
-        below = [_BELOW[name](study)] if name in _BELOW else []
+        paragraphs = [make_tag("p", line) for line in kind.about(study.results)]
+        tables = [_BELOW[name](study)] if name in _BELOW else []
         try:
             figure = _embed_figure(study, name)
         except RecordingError:
             figure = make_tag("p", f"No figure: {NO_RECORDING}.")
-        yield _Section(f"section-{name}", kind.title, [*about, figure, *below])
+        yield _Section(f"section-{name}", kind.title, [*paragraphs, figure, *tables])
 
 
 def _configuration_key(study: ReportData) -> Html:

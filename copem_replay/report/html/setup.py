@@ -80,12 +80,12 @@ def _read_table(logs: Sequence[Any]) -> Iterator[Html]:
         make_tag(
             "tr",
             make_tag("th", str(log["log"]), scope="row"),
-            make_tag("td", str(found["number"])),
-            make_tag("td", str(found["what"]), class_="text"),
-            make_tag("td", "may change figures" if found["changes"] else "–", class_="text"),
+            make_tag("td", str(finding["number"])),
+            make_tag("td", str(finding["what"]), class_="text"),
+            make_tag("td", "may change figures" if finding["changes"] else "–", class_="text"),
         )
         for log in logs
-        for found in log.get("read", ())
+        for finding in log.get("read", ())
     ]
     if rows:
         caption = "What was left out or mended when recordings were read"
@@ -213,32 +213,32 @@ def describe_question(study: ReportData) -> str:
 def describe_setting(study: ReportData) -> str:
     """How it was measured: number of rows, seed, start of the clock, confirmation, errors of units."""
     results, experiment = study.results, study.results.experiment
-    things = results.known.groupby(["log", "object_id"]).ngroups
+    objects = results.known.groupby(["log", "object_id"]).ngroups
     episodes = results.known.groupby(["log", "object_id", "episode"]).ngroups
-    times = f" with {count_noun(episodes, 'episode')}" if episodes > things else ""
+    times = f" with {count_noun(episodes, 'episode')}" if episodes > objects else ""
     tally = results.tally[results.tally["event"] == DETECTED]
-    left = tally[~is_counted(tally, experiment.measure.began)].drop_duplicates(["log", "object_id", "episode"])
+    uncounted = tally[~is_counted(tally, experiment.measure.began)].drop_duplicates(["log", "object_id", "episode"])
     rows = int(results.known["runs"].sum()) // len(study.names)
     confirm = experiment.measure.confirm
     hits = f" An object is known when {confirm.hits} of {confirm.of} captures hold it." if confirm.hits > 1 else ""
     return (
-        f"{count_noun(things, 'measured object')}{times}, {count_noun(experiment.runs, 'run')}, so "
+        f"{count_noun(objects, 'measured object')}{times}, {count_noun(experiment.runs, 'run')}, so "
         f"{count_noun(rows, 'row')} for each configuration; common random numbers per run (seed {experiment.seed})."
-        f"{_describe_others(experiment, left) if len(left) else ''} "
+        f"{_describe_others(experiment, uncounted) if len(uncounted) else ''} "
         f"The clock of an object starts {_describe_onset(experiment)}.{hits}{describe_unit_errors(experiment)}"
     )
 
 
-def _describe_others(experiment: Experiment, left: pd.DataFrame) -> str:
+def _describe_others(experiment: Experiment, rest: pd.DataFrame) -> str:
     """Episodes that do not count, one row each: how many, and why: most were there when the recording began."""
-    what, one = "object" if left["episode"].max() == 0 else "episode", len(left) == 1
+    noun, one = "object" if rest["episode"].max() == 0 else "episode", len(rest) == 1
     where = "in range" if experiment.measure.onset.kind == "in_range" else "there"
-    if (left["began"] == BEGAN[LOG_START]).all() and BEGAN[LOG_START] not in experiment.measure.began:
-        left = left[has_frame_after(left)]  # as the screen of `run` counts them
+    if (rest["began"] == BEGAN[LOG_START]).all() and BEGAN[LOG_START] not in experiment.measure.began:
+        rest = rest[has_frame_after(rest)]  # as the screen of `run` counts them
         was, them = ("was", "it does") if one else ("were", "they do")
-        return f" {len(left)} more {what}{'' if one else 's'} {was} {where} when the recording began; {them} not count."
+        return f" {len(rest)} more {noun}{'' if one else 's'} {was} {where} when the recording began; {them} not count."
     return (
-        f" {len(left)} more {what}{'' if one else 's'} {'does' if one else 'do'} not count: what counts began "
+        f" {len(rest)} more {noun}{'' if one else 's'} {'does' if one else 'do'} not count: what counts began "
         f"{' or '.join(experiment.measure.began)}, and is seen for more than one frame."
     )
 
@@ -291,28 +291,28 @@ def _describe_fusion(configuration: Configuration) -> str:
 def _describe_component(component: Component) -> str:
     values = component.model_dump(mode="json", by_alias=True)
     kind = str(values.pop("kind"))
-    plain = {key: field.get_default() for key, field in type(component).model_fields.items()}
+    defaults = {key: field.get_default() for key, field in type(component).model_fields.items()}
     components = {
         key: value for key in type(component).model_fields if isinstance(value := getattr(component, key), Component)
     }
-    values |= {key: _describe_component(value) for key, value in components.items() if value != plain.get(key)}
-    plain |= {key: values[key] for key, value in components.items() if value == plain.get(key)}
-    other = [f"{key}: {value}" for key, value in values.items() if value != plain.get(key)]
+    values |= {key: _describe_component(value) for key, value in components.items() if value != defaults.get(key)}
+    defaults |= {key: values[key] for key, value in components.items() if value == defaults.get(key)}
+    other = [f"{key}: {value}" for key, value in values.items() if value != defaults.get(key)]
     return f"{kind} ({', '.join(other)})" if other else kind
 
 
 def _describe_links(experiment: Experiment, configuration: Configuration, units: Sequence[str]) -> str:
     """Links by which lists come, latency, and rate at which the receiver issues lists."""
-    by: dict[str, list[str]] = {}
+    units_by_link: dict[str, list[str]] = {}
     senders = units or (TRUTH,)
     for unit in senders:
         link = configuration.link_of(unit)
         if isinstance(link, str):
-            by.setdefault(f"link {link} = {_describe_component(experiment.links[link])}", []).append(unit)
+            units_by_link.setdefault(f"link {link} = {_describe_component(experiment.links[link])}", []).append(unit)
         elif link is not None:
-            by.setdefault(_describe_component(link), []).append(unit)
+            units_by_link.setdefault(_describe_component(link), []).append(unit)
     all_of = len(senders)
-    links = [link if len(of) == all_of else f"{name_first(of, NAMED)} by {link}" for link, of in by.items()]
+    links = [link if len(of) == all_of else f"{name_first(of, NAMED)} by {link}" for link, of in units_by_link.items()]
     late = [_describe_latency(configuration, units)] if configuration.latency_s or not links else []
     issued = [f"issued at {configuration.issue_hz:g} Hz"] if configuration.issue_hz is not None else []
     return "; ".join([*links, *late, *issued])

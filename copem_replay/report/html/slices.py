@@ -54,8 +54,8 @@ def _group_table(study: ReportData, by: str, rows: pd.DataFrame) -> Html:
     lines = []
     for row in rows.to_dict("records"):
         name = str(row["configuration"])
-        of = make_tag("span", line_swatch(study.looks[name]), make_tag("span", allow_breaks(name)), class_="named")
-        cells = [make_tag("td", of, class_="text"), make_tag("td", str(row["objects"]))]
+        cell = make_tag("span", line_swatch(study.looks[name]), make_tag("span", allow_breaks(name)), class_="named")
+        cells = [make_tag("td", cell, class_="text"), make_tag("td", str(row["objects"]))]
         cells += [_figure_cell(row, name) for name in names]
         lines.append(make_tag("tr", make_tag("th", allow_breaks(str(row["group"])), scope="row"), *cells))
     head = [by, "configuration", "objects", *map(column_header, names)]
@@ -101,26 +101,26 @@ def _object_table(rows: pd.DataFrame, names: list[str]) -> Html:
     mean_s = sums["time_s"] / sums["known"].where(sums["known"] > 0)
     latest = pd.DataFrame({"share": share, "mean_s": mean_s}).groupby(level=[0, 1], sort=False).mean()
     order = latest.sort_values(["share", "mean_s"], ascending=[True, False], kind="stable").index
-    found = {of: (float(share[of]), float(mean_s[of])) for of in share.index}
+    known_by_row = {key: (float(share[key]), float(mean_s[key])) for key in share.index}
     episodes = rows.drop_duplicates(["object_id", "episode"]).set_index(["object_id", "episode"])
     lines = []
-    for of in order:
-        episode = episodes.loc[of]
-        head = make_tag("th", f"{of[0]}{f' ({of[1] + 1})' if of[1] else ''}", scope="row")
+    for key in order:
+        episode = episodes.loc[key]
+        head = make_tag("th", f"{key[0]}{f' ({key[1] + 1})' if key[1] else ''}", scope="row")
         cells = [make_tag("td", str(episode["object_class"]), class_="text")]
         cells += [
             make_tag("td", format_two_decimals(float(episode[name]))) for name in ("onset_s", "distance_at_onset_m")
         ]
-        cells += [make_tag("td", _when_known(found.get((*of, name)))) for name in names]
+        cells += [make_tag("td", _when_known(known_by_row.get((*key, name)))) for name in names]
         lines.append(make_tag("tr", head, *cells))
     return make_table(["object", "class", "counts from, s", "range then, m", *names], lines)
 
 
-def _when_known(found: tuple[float, float] | None) -> str:
-    """`0.4 s`; where it is not known in every run, `0.4 s in 75 %`. `found`: share of the runs, and mean seconds."""
-    if found is None:
+def _when_known(known: tuple[float, float] | None) -> str:
+    """`0.4 s`; where it is not known in every run, `0.4 s in 75 %`. `known`: share of the runs, and mean seconds."""
+    if known is None:
         return "–"
-    share, mean_s = found
+    share, mean_s = known
     if not share:
         return "never"
     return f"{format_two_decimals(mean_s)} s" + ("" if share == 1 else f" in {format_per_cent(share)} %")

@@ -85,13 +85,13 @@ class ReportData:
         return self.results.summary.set_index("configuration").loc[name]
 
 
-def load_study(given: Path | Results, baseline: str | None = None, by: Sequence[str] | None = None) -> ReportData:
+def load_study(source: Path | Results, baseline: str | None = None, by: Sequence[str] | None = None) -> ReportData:
     """Compare the configurations of results, or of a results folder, with a baseline.
 
     None: that of `compare`. `by`: entries of slices, None: those of the experiment. Raises InputError: no or damaged
     results, no such baseline.
     """
-    results = given if isinstance(given, Results) else read_results(given, rowless=True)
+    results = source if isinstance(source, Results) else read_results(source, rowless=True)
     check_summary(results)
     names = tuple(results.experiment.configurations)
     if baseline is not None and baseline not in names:

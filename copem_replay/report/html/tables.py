@@ -307,7 +307,7 @@ _METRIC_NAMES = re.compile("|".join(rf"\b{name}\b" for name in sorted(COMPARED, 
 
 def _replace_metric_names(line: str) -> str:
     """A line of the comparison with headers of columns in place of their names."""
-    line = _METRIC_NAMES.sub(lambda found: strip_unit(found[0]), line)
+    line = _METRIC_NAMES.sub(lambda match: strip_unit(match[0]), line)
     return f"{line[:1].upper()}{line[1:]}."
 
 
@@ -402,19 +402,19 @@ def _group_misses(missed: pd.DataFrame, order: Sequence[str]) -> list[tuple[pd.S
 
 def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
     by_all = len(names) == len(study.names) > 1
-    by = f"all {len(names)} configurations" if by_all else ", ".join(names)
-    again = f", episode {row['episode']}" if row["episode"] else ""
+    configurations = f"all {len(names)} configurations" if by_all else ", ".join(names)
+    suffix = f", episode {row['episode']}" if row["episode"] else ""
     log, object_id = str(row["log"]), str(row["object_id"])
     links, command = [link_story(log, object_id), link_player(log, object_id)], study.view_command(log, object_id)
     return make_tag(
         "tr",
         make_tag("th", str(row["log"]), scope="row"),
-        make_tag("td", f"{object_id}{again}", class_="text"),
+        make_tag("td", f"{object_id}{suffix}", class_="text"),
         make_tag("td", str(row["object_class"]), class_="text"),
         make_tag("td", f"{count_noun(int(row['runs']), 'run') if row['missed'] == row['runs'] else row['missed']}"
             + (" (all)" if row["missed"] == row["runs"] else f" of {count_noun(int(row['runs']), 'run')}"),
             data_value=str(row["missed"])),
-        make_tag("td", by, class_="text long"),
+        make_tag("td", configurations, class_="text long"),
         make_tag("td", format_cell(float(row["ended_s"] - row["onset_s"]))),
         make_tag("td", EndReason(row["ended_by"]).past, class_="text"),
         make_tag("td", join_html([*links, make_tag("code", command)] if command else links, " "), class_="text long"),
@@ -429,14 +429,14 @@ def stage_table(study: ReportData) -> Html:
     means = mean_stages_by_configuration(study.results, study.names)
     stages = [stage for stage in STAGES if any(stage in means_of_name for means_of_name in means.values())]
     detected = count_detected(study.results)
-    about = (
+    note = (
         "Means over the rows in which the object is detected; how many these are, where not all, is beside the bar. "
         "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "
         "and their sum is not the mean time to detection."
     )
     terms = [part for stage in stages for part in (make_tag("dt", stage), make_tag("dd", STAGES[stage]))]
     below = fold_parts("What the stages are", make_tag("dl", *terms))
-    return join_html([make_tag("p", about), _stages_table(study, means, stages, detected), below])
+    return join_html([make_tag("p", note), _stages_table(study, means, stages, detected), below])
 
 
 def _stages_table(
@@ -483,14 +483,14 @@ def verdicts_table(verdicts: Judgement) -> Html:
     rows = [
         make_tag(
             "tr",
-            make_tag("th", one.name, scope="row"),
-            make_tag("td", allow_breaks(one.configuration), class_="text"),
-            make_tag("td", allow_breaks(one.asked), class_="text"),
-            make_tag("td", one.found, " ", make_tag("span", one.limits, class_="interval")),
-            make_tag("td", verdict_mark(one), " ", make_tag("span" if one.passes else "b", one.result), class_="text"),
-            make_tag("td", one.why, class_="text long"),
+            make_tag("th", v.name, scope="row"),
+            make_tag("td", allow_breaks(v.configuration), class_="text"),
+            make_tag("td", allow_breaks(v.asked), class_="text"),
+            make_tag("td", v.found, " ", make_tag("span", v.limits, class_="interval")),
+            make_tag("td", verdict_mark(v), " ", make_tag("span" if v.passes else "b", v.result), class_="text"),
+            make_tag("td", v.why, class_="text long"),
         )
-        for one in verdicts.all
+        for v in verdicts.all
     ]
     below = [make_tag("p", f"{text}.", class_="below") for text in (verdicts.chance, *verdicts.notes)]
     headline = make_tag("p", f"{verdicts.headline}.", class_="lead")

@@ -100,25 +100,25 @@ class AllLogs:
     _regrets: dict[str, list[Regret]] = field(default_factory=dict)
 
     def add(
-        self, first: PairSide, second: PairSide, regrets: Sequence[Regret], *, more: bool, over_runs: bool = False
+        self, first: PairSide, second: PairSide, regrets: Sequence[Regret], *, several: bool, over_runs: bool = False
     ) -> None:
-        """Add a log with its regrets. `more`: there are other logs. `over_runs`: intervals are over runs."""
+        """Add a log with its regrets. `several`: there are other logs. `over_runs`: intervals are over runs."""
         self.alone.append((int((first.there & ~second.there).sum()), int((second.there & ~first.there).sum())))
         self.same = self.same and first.has_rows_of(second)
         for regret in regrets:
             # Runs and passes stay apart for a single object: they are the clusters if no log has another.
             runs = over_runs or regret.counts[0][0] <= 1
-            figure = regret.figure.condensed(runs=runs) if more else regret.figure
+            figure = regret.figure.condensed(runs=runs) if several else regret.figure
             self._regrets.setdefault(regret.metric, []).append(replace(regret, figure=figure))
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """How many logs, objects and passes both sides have rows of."""
+        """The number of logs, objects and passes of which both sides have rows."""
         of_logs = next(iter(self._regrets.values()), [])
         return total_counts(counts for regret in of_logs for counts in regret.counts)
 
     def count_better(self, metric: str) -> int:
-        """The number of logs whose own difference is for the better."""
+        """The number of logs in which the configuration is better."""
         return sum(COMPARED[metric].better * difference > 0 for difference in self.differences.get(metric, ()))
 
     def regrets(self, weigh: str | None) -> Iterator[Regret]:
@@ -131,10 +131,9 @@ class AllLogs:
 
 @dataclass(frozen=True)
 class PairsAsked:
-    """Of which rows differences are asked, and their intervals. `episodes`: by log the object and episode of each that
-    is meant, or all of a log (None); no logs but these; None: all logs. `every`: all of these count, however they
-    began. `over_runs`: intervals are over runs of the logs. `weigh`: what counts alike; None: as `measure.weigh`.
-    `by_log`: there are also rows of each log.
+    """The rows and intervals of a comparison. `episodes`: by log the objects and episodes to compare, or all of a log
+    (None); None: all logs. `every`: all of these count, however they began. `over_runs`: intervals are over runs of the
+    logs. `weigh`: what counts alike; None: as `measure.weigh`. `by_log`: there are also rows of each log.
     """
 
     episodes: Mapping[str, Collection[tuple[str, int]] | None] | None = None
@@ -145,7 +144,7 @@ class PairsAsked:
     by_log: bool = True
 
     def restrict(self, log: str, grid: PairingGrid, side: PairSide) -> PairSide:
-        """A side of a pair with the cells that are asked for alone; ghosts belong to whole logs."""
+        """A side of a pair with only the requested cells; ghosts belong to whole logs."""
         counted = side.counted_however_begun if self.every else side.counted
         if self.episodes is None or (kept := self.episodes.get(log, ())) is None:
             return replace(side, counted=counted)
@@ -156,19 +155,17 @@ class PairsAsked:
 # The results folders of a comparison.
 
 
-def read_folders(given: Sequence[Path | Results]) -> list[Results]:
-    """Results folders; open ones are not read again. Raises InputError, a line for each folder that cannot be read or
-    is given twice.
-    """
+def read_folders(inputs: Sequence[Path | Results]) -> list[Results]:
+    """Results folders; open ones are not read again. Raises InputError, a line per unreadable or repeated folder."""
     folders: list[Results] = []
     problems: list[str] = []
-    seen: dict[str, Path] = {}
-    for folder in given:
+    first_path: dict[str, Path] = {}
+    for folder in inputs:
         path = folder.place if isinstance(folder, Results) else folder
-        if (place := os.path.realpath(path)) in seen:
-            problems.append(f"{path}: expected each folder once, found it twice ({seen[place]})")
+        if (place := os.path.realpath(path)) in first_path:
+            problems.append(f"{path}: expected each folder once, found it twice ({first_path[place]})")
             continue
-        seen[place] = path
+        first_path[place] = path
         try:
             results = folder if isinstance(folder, Results) else open_results(folder)
             folders.append(results)
@@ -208,8 +205,8 @@ _FEW_HAVE_IT = (
 )
 
 
-def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | None) -> Iterator[str]:
-    """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `asked` a minute.
+def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], per_min: float | None) -> Iterator[str]:
+    """Notes on missing intervals, on decisive logs, and on configurations with fewer ghosts than `per_min` a minute.
 
     None: than their baselines.
     """
@@ -217,24 +214,24 @@ def notes_on_rows(table: pd.DataFrame, pairs: Iterable[AllLogs], asked: float | 
     none = [count for count in counts if count[0] and choose_over(*count) is None]
     why = f"{explain_no_clusters(*none[0])}; {NOT_ENOUGH}" if none else None
     overall = table.drop_duplicates(["configuration", "metric"])
-    without = overall[overall["difference"].notna() & overall["interval"].isna()]
+    no_interval = overall[overall["difference"].notna() & overall["interval"].isna()]
     with_interval = set(overall.loc[overall["interval_over"].notna(), "configuration"])
-    nameless = (without["metric"] == "false_positives_per_min") & without["configuration"].isin(with_interval)
+    nameless = (no_interval["metric"] == "false_positives_per_min") & no_interval["configuration"].isin(with_interval)
     if nameless.any():
         yield (
             "no interval of false_positives_per_min: without accuracy.parquet it is not known which object a ghost is "
             "nearest to"
         )
-    without = without[~nameless]
-    if len(without):
-        metrics = ", ".join(dict.fromkeys(without["metric"]))
+    no_interval = no_interval[~nameless]
+    if len(no_interval):
+        metrics = ", ".join(dict.fromkeys(no_interval["metric"]))
         yield f"no interval of {metrics}: {why or _FEW_HAVE_IT}"
     decisive = overall[overall["hangs_on"].notna()]
     for log, rows in decisive.groupby("hangs_on", sort=False):
         listed = (f"{row.metric} of {row.configuration} {row.difference_without_it:+.3g}" for row in rows.itertuples())
         yield f"hangs on log {log}; without it: {', '.join(listed)}"
     ghosts = overall[overall["metric"] == "ttd_rmst_s_equal_ghosts"]
-    rates = ghosts["baseline_ghosts_kept_per_min"] if asked is None else asked
+    rates = ghosts["baseline_ghosts_kept_per_min"] if per_min is None else per_min
     fewer = ghosts[ghosts["ghosts_kept_per_min"] < rates * (1 - 1e-9)]
     for rate, rows in fewer.groupby("ghosts_kept_per_min", sort=False):
         yield (
@@ -281,7 +278,7 @@ class Comparison:
 
     @property
     def changed(self) -> Comparison:
-        """Without the configurations that are unchanged."""
+        """The comparison without configurations that are unchanged."""
         names = tuple(name for name in self.configurations if name not in self.unchanged)
         table, groups = (of if of is None else of[of["configuration"].isin(names)] for of in (self.table, self.groups))
         return replace(self, configurations=names, table=table, groups=groups)
@@ -314,9 +311,9 @@ def compare_folders(
     if len(newer) == 1:  # the name alone says which one it is
         pairs = {replace(labelled, label=labelled.configuration): other for labelled, other in pairs.items()}
     sides = list(dict.fromkeys(labelled for pair in pairs.items() for labelled in reversed(pair)))  # baselines first
-    used = list(dict.fromkeys(labelled.results for labelled in sides))
+    used_results = list(dict.fromkeys(labelled.results for labelled in sides))
     logs, runs = [log.name for log in read[0].provenance.logs], min(folder.provenance.runs for folder in read)
-    horizon_s, horizon_notes = _settle_horizon(used)
+    horizon_s, horizon_notes = _settle_horizon(used_results)
     setting = PairSettings(horizon_s, float(read[0].provenance.measure["gospa"]["power"]))
     of_ghosts = false_positives_per_min is not None or "thresholds.parquet" in list_tables(metrics)
     totals = ghost_totals(sides, logs, runs) if of_ghosts else {}
@@ -330,8 +327,8 @@ def compare_folders(
     sums, of_logs, of_groups = _compare_each_log(pair_rows, settings, metrics, groups)
     rows, limit = pair_rows.of_all_logs(sums)
     moved = {row["configuration"] for row in rows if row["difference"]}
-    same = [one.label for one in pairs if newer and sums[one].same and one.label not in moved]
-    stars = Stars(decide, matters or {}, same)
+    unchanged = [one.label for one in pairs if newer and sums[one].same and one.label not in moved]
+    stars = Stars(decide, matters or {}, unchanged)
     stars.mark(rows, limit)
     table = COMPARISON.frame([*rows, *of_logs])
     why = "each configuration against itself there" if newer else None
@@ -349,11 +346,11 @@ def compare_folders(
         matters=matters or {},
         truths=tuple(labelled.label for labelled in sides if labelled.facts.truth),
         newer=tuple(newer),
-        unchanged=tuple(same),
+        unchanged=tuple(unchanged),
         notes=(
-            *notes_on_folders(used),
+            *notes_on_folders(used_results),
             *horizon_notes,
-            *notes_on_differences(used, renames),
+            *notes_on_differences(used_results, renames),
             *(notes_on_missing(read) if newer and configurations is None else ()),
             *notes_on_pairs(pairs, sums),
             *notes_on_output_baseline(pairs),
@@ -385,9 +382,9 @@ def _check_named(decide: str | None, matters: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class Stars:
-    """How the stars of a table are held: over all its differences, or those of the metric that was named to `decide`.
+    """How differences get a star: all of a table held together, or those of the one metric named to `decide`.
 
-    `matters`: by metric the least difference that matters. `without`: configurations of which nothing can differ.
+    `matters`: by metric the least difference that matters. `without`: configurations in which nothing can differ.
     """
 
     decide: str | None
@@ -395,33 +392,33 @@ class Stars:
     without: Sequence[str] = ()
 
     def mark(self, rows: Sequence[dict[str, Any]], limit: Sequence[Callable[[float], Mapping[str, object]]]) -> None:
-        """Give rows, of one table, the columns `star` and `word`; `limit`: of each its limits at a confidence."""
+        """Add the columns `star` and `word` to the rows of one table; `limit`: by row its limits at a confidence."""
         may_differ = (k for k, row in enumerate(rows) if row["configuration"] not in self.without)
         asked = [k for k in may_differ if self.decide in (None, rows[k]["metric"])]
         number = sum(rows[k]["difference"] is not None for k in asked)
-        alone = {k for k, row in enumerate(rows) if is_off_zero(row)}
-        may = [k for k in asked if k in alone]
-        held = {may[k] for k in find_stars(number, [limit[k] for k in may])}
+        off_zero = {k for k, row in enumerate(rows) if is_off_zero(row)}
+        may = [k for k in asked if k in off_zero]
+        starred = {may[k] for k in find_stars(number, [limit[k] for k in may])}
         for k, row in enumerate(rows):
-            row["star"] = STAR if k in held else ALONE if k in alone else None
+            row["star"] = STAR if k in starred else ALONE if k in off_zero else None
             if row["metric"] in self.matters and row["difference"] is not None:
                 row["word"] = describe_difference(row, COMPARED[row["metric"]].better, self.matters[row["metric"]])
 
 
 def _settle_ghosts(
-    setting: PairSettings, pairs: Pairs, totals: Mapping[LabelledConfiguration, GhostTotals], asked: float | None
+    setting: PairSettings, pairs: Pairs, totals: Mapping[LabelledConfiguration, GhostTotals], requested: float | None
 ) -> tuple[dict[LabelledConfiguration, PairSettings], dict[str, str | None]]:
     """The settings of each pair, with operating points at equal ghosts; by label why there are none, None: there are.
 
-    `asked`: ghosts per minute that the user asked for; None: those of each baseline.
+    `requested`: ghosts per minute that the user asked for; None: those of each baseline.
     """
     settings, reasons = {}, {}
-    for labelled, against in pairs.items():
-        both = totals.get(labelled), totals.get(against)
-        per_min = both[1].per_min if asked is None and both[1] is not None else asked
-        why = explain_incomparable(*both, per_min, asked=asked is not None, truth=against.facts.truth)
-        kept = None if why is not None else find_operating_points(*both, per_min)
-        reasons[labelled.label], settings[labelled] = why, replace(setting, kept=kept)
+    for labelled, baseline in pairs.items():
+        both = totals.get(labelled), totals.get(baseline)
+        per_min = both[1].per_min if requested is None and both[1] is not None else requested
+        why = explain_incomparable(*both, per_min, by_user=requested is not None, truth=baseline.facts.truth)
+        points = None if why is not None else find_operating_points(*both, per_min)
+        reasons[labelled.label], settings[labelled] = why, replace(setting, kept=points)
     return settings, reasons
 
 
@@ -454,23 +451,23 @@ def _compare_each_log(
 
         # What several are held against is laid out once, what one is held against is gone after it.
         lay_out_baseline = lru_cache(1 + len({*remembering.values()}))(lay_out)
-        for labelled, against in pairs.items():
-            second, first = lay_out_baseline(against), lay_out(labelled)
-            held = lay_out_baseline(remembering[labelled]) if labelled in remembering else None
-            _check_same_episodes(labelled, first, against, second, log, grid)
-            _check_same_frames(labelled, first, against, second, log)
-            regrets = _compute_regrets(first, second, held, grid, settings[labelled], metrics)
-            sums[labelled].add(first, second, regrets, more=len(logs) > 1, over_runs=asked.over_runs)
+        for labelled, baseline in pairs.items():
+            second, first = lay_out_baseline(baseline), lay_out(labelled)
+            remembered = lay_out_baseline(remembering[labelled]) if labelled in remembering else None
+            _check_same_episodes(labelled, first, baseline, second, log, grid)
+            _check_same_frames(labelled, first, baseline, second, log)
+            regrets = _compute_regrets(first, second, remembered, grid, settings[labelled], metrics)
+            sums[labelled].add(first, second, regrets, several=len(logs) > 1, over_runs=asked.over_runs)
             for regret in regrets if len(logs) > 1 and asked.by_log else ():
                 values = regret.figure.values()
                 sums[labelled].differences.setdefault(regret.metric, []).append(values[2])
                 rows.append({"log": log, **pair_rows.make(labelled, regret, values)})
             for group, kept in groups.select(log, grid):
-                one, other = (groups.restrict(group, kept, side) for side in (first, second))
-                beside = None if held is None else groups.restrict(group, kept, held)
-                regrets = _compute_regrets(one, other, beside, grid, settings[labelled], metrics)
+                first_group, second_group = (groups.restrict(group, kept, side) for side in (first, second))
+                beside = None if remembered is None else groups.restrict(group, kept, remembered)
+                regrets = _compute_regrets(first_group, second_group, beside, grid, settings[labelled], metrics)
                 of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
-                of_pair.add(one, other, regrets, more=len(logs) > 1)
+                of_pair.add(first_group, second_group, regrets, several=len(logs) > 1)
     return sums, rows, of_groups
 
 
@@ -507,7 +504,7 @@ def _tabulate_groups(pair_rows: PairRows, of_groups: GroupPairs, groups: Episode
 
 @dataclass(frozen=True)
 class PairRows:
-    """The rows of pairs: what each configuration is held against, in accuracy what it is `remembering`."""
+    """The rows of pairs: the baseline of each configuration, and for accuracy its ideal with memory, `remembering`."""
 
     pairs: Pairs
     remembering: Pairs
@@ -517,9 +514,9 @@ class PairRows:
     def of_all_logs(
         self, sums: Mapping[LabelledConfiguration, AllLogs]
     ) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
-        """The rows of all logs, and of each its limits at a confidence.
+        """The rows over all logs, each with its limits at a confidence.
 
-        Of intervals over logs: how many logs are better, and on which the difference hangs.
+        Of intervals over logs: the number of logs that are better, and the log on which the difference hangs.
         """
         rows: list[dict[str, Any]] = []
         limit: list[Callable[[float], Mapping[str, object]]] = []
@@ -568,8 +565,8 @@ class PairRows:
         """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
         over, difference = "runs" if self.asked.over_runs else regret.over, values[2]
         sides = labelled, self._baseline_of(labelled, regret.metric)
-        what = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
-        fixed = all(getattr(side.facts, what) for side in sides)
+        fact = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
+        fixed = all(getattr(side.facts, fact) for side in sides)
         limits = difference_limits(regret.figure, difference, over, self.names, fixed=fixed, confidence=confidence)
         never = [_is_never_worse(regret.metric, *of) for of in zip(sides, sides[::-1], values, strict=False)]
         sign = COMPARED[regret.metric].better * (never[0] - never[1])
@@ -590,17 +587,17 @@ _OF_ERRORS = ("position_rmse_held_m", "gospa_held_m", "false_positives_per_min",
 """Metrics in which nothing is better than a truth without latency, which has 0."""
 
 
-def _is_never_worse(metric: str, one: LabelledConfiguration, other: LabelledConfiguration, value: float) -> bool:
+def _is_never_worse(metric: str, side: LabelledConfiguration, other: LabelledConfiguration, value: float) -> bool:
     """Whether one, which has a `value`, is as good as the other in every row, or better, whatever is drawn.
 
     What is fused by truth ids has no false positive.
     """
     facts = other.facts
     if metric not in _IN_TIME:
-        by_id = one.facts.by_truth_id and metric == "false_positives_per_min"
-        return value == 0 and metric in _OF_ERRORS and (one.facts.truth or by_id)
-    of_inputs = one.results is other.results and (facts.ideal, facts.ideal_of) == (one.configuration, "inputs")
-    return one.facts.truth or (of_inputs and not facts.recorded)
+        by_id = side.facts.by_truth_id and metric == "false_positives_per_min"
+        return value == 0 and metric in _OF_ERRORS and (side.facts.truth or by_id)
+    of_inputs = side.results is other.results and (facts.ideal, facts.ideal_of) == (side.configuration, "inputs")
+    return side.facts.truth or (of_inputs and not facts.recorded)
 
 
 def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
@@ -614,38 +611,38 @@ def _settle_horizon(folders: Sequence[Results]) -> tuple[float, list[str]]:
 
 
 def _check_same_episodes(
-    labelled: LabelledConfiguration, first: PairSide, against: LabelledConfiguration, second: PairSide, log: str,
+    labelled: LabelledConfiguration, first: PairSide, baseline: LabelledConfiguration, second: PairSide, log: str,
     grid: PairingGrid,
 ) -> None:  # fmt: skip
     """Raise InputError where an episode begins or ends at another instant, so that its rows are no pair."""
-    if labelled.results is against.results:
+    if labelled.results is baseline.results:
         return
-    both = first.there & second.there
-    for what in ("onset_s", "ended_s"):
-        found, expected = first.rows[what], second.rows[what]
-        other = np.flatnonzero(both & (np.abs(found - expected) > SAME_INSTANT_S))
-        if len(other):
-            name = grid.episodes[other[0] // grid.runs][0]
+    in_both = first.there & second.there
+    for column in ("onset_s", "ended_s"):
+        actual, expected = first.rows[column], second.rows[column]
+        off = np.flatnonzero(in_both & (np.abs(actual - expected) > SAME_INSTANT_S))
+        if len(off):
+            name = grid.episodes[off[0] // grid.runs][0]
             raise InputError(
-                f"{labelled.results.place}: log {log}: object {name}: expected {what} {expected[other[0]]:g} as in "
-                f"{against.results.place}, found {found[other[0]]:g}: not the same ego, recording or units"
+                f"{labelled.results.place}: log {log}: object {name}: expected {column} {expected[off[0]]:g} as in "
+                f"{baseline.results.place}, found {actual[off[0]]:g}: not the same ego, recording or units"
             )
 
 
 def _check_same_frames(
-    labelled: LabelledConfiguration, first: PairSide, against: LabelledConfiguration, second: PairSide, log: str
+    labelled: LabelledConfiguration, first: PairSide, baseline: LabelledConfiguration, second: PairSide, log: str
 ) -> None:
     """Raise InputError where what is held is told at other frames, so that its values are no pairs."""
-    both = first.there & second.there
-    if first.accuracy is None or second.accuracy is None or not both.any():
+    in_both = first.there & second.there
+    if first.accuracy is None or second.accuracy is None or not in_both.any():
         return
-    found, expected = first.accuracy, second.accuracy
-    same = len(found.frame_s) == len(expected.frame_s)
-    same = same and bool((np.abs(found.frame_s - expected.frame_s) <= SAME_INSTANT_S).all())
+    actual, expected = first.accuracy, second.accuracy
+    is_same = len(actual.frame_s) == len(expected.frame_s)
+    is_same = is_same and bool((np.abs(actual.frame_s - expected.frame_s) <= SAME_INSTANT_S).all())
     for name in ("first", "length"):
-        same = same and np.array_equal(getattr(found, name)[both], getattr(expected, name)[both])
-    if not same:
+        is_same = is_same and np.array_equal(getattr(actual, name)[in_both], getattr(expected, name)[in_both])
+    if not is_same:
         raise InputError(
             f"{labelled.results.place}: log {log}: {labelled.configuration}: expected the frames of "
-            f"{against.configuration} in {against.results.place}, found others; {AGAIN}"
+            f"{baseline.configuration} in {baseline.results.place}, found others; {AGAIN}"
         )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class EpisodeGroups:
-    """The groups that entries of `by` make of the episodes of results: of each its entry and its label.
+    """The groups that the entries of `by` make of the episodes of results, each with its entry and its label.
 
     Raises InputError for an entry that is none.
     """
@@ -42,29 +42,29 @@ class EpisodeGroups:
         tags = {log.name: log.tags for log in results.provenance.logs}
         episodes = results.tally.drop_duplicates([*EPISODE])
         keys = list(zip(*(episodes[name].tolist() for name in EPISODE), strict=True))
-        for by in read_slices(results, entries):
-            number, names = number_groups(episodes, by, tags)
+        for entry in read_slices(results, entries):
+            number, names = number_groups(episodes, entry, tags)
             for key, k in zip(keys, (number + len(self.named)).tolist(), strict=True):
                 self._of.setdefault(key, []).append(k)
-            self.named += [(by, ", ".join(values)) for values in names]
+            self.named += [(entry, ", ".join(values)) for values in names]
 
     def select(self, log: str, grid: PairingGrid) -> Iterator[tuple[int, Bool]]:
-        """The groups that have episodes of a log, by their number, and which cells (N·S,) they have."""
+        """The numbers of the groups with episodes of a log, and a mask (N·S,) of the cells of each."""
         of_episodes = [self._of.get((log, *episode), []) for episode in grid.episodes]
         for k in sorted({k for of in of_episodes for k in of}):
             yield k, np.repeat([k in of for of in of_episodes], grid.runs)
 
-    def restrict(self, k: int, kept: Bool, side: PairSide) -> PairSide:
-        """A side of a pair with the cells of a group alone; by `began` each group counts its own episodes."""
-        by, counted = self.named[k][0], side.counted
-        if by.names(BEGAN_BY):
+    def restrict(self, k: int, in_group: Bool, side: PairSide) -> PairSide:
+        """A side of a pair with only the cells of a group; by `began` each group counts its own episodes."""
+        entry, counted = self.named[k][0], side.counted
+        if entry.names(BEGAN_BY):
             counted = side.counted_however_begun
-        lists = side.lists if by.of_logs else None
-        return replace(side, there=side.there & kept, counted=counted & kept, lists=lists)
+        lists = side.lists if entry.of_logs else None
+        return replace(side, there=side.there & in_group, counted=counted & in_group, lists=lists)
 
 
 def without_limits_over_runs(row: dict[str, object]) -> dict[str, object]:
-    """A row of a comparison, without limits over the runs of a single object: they tell of no group."""
+    """The row of a comparison without limits, if these are over the runs of one object, which say nothing on groups."""
     if row.get("interval_over") in TRAFFIC:
         return row
     return {name: value for name, value in row.items() if name not in _LIMITS}
@@ -74,16 +74,14 @@ _LIMITS = ("low", "high", "low_bounded", "high_bounded", "interval", "interval_o
 
 
 def describe_group_chance(table: pd.DataFrame) -> list[str]:
-    """A line for each entry: how many groups and differences were looked at, how many intervals exclude 0, and how many
-    would by chance.
-    """
+    """One line per entry: numbers of groups, of differences, of intervals that exclude 0, and of those by chance."""
     lines = []
-    for by, rows in table.groupby("by", sort=False):
+    for entry, rows in table.groupby("by", sort=False):
         limited = rows[rows["interval_over"].notna()]
-        apart = int(limited["star"].notna().sum())
+        off_zero = int(limited["star"].notna().sum())
         lines.append(
-            f"by {by}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
-            f"{count_noun(len(limited), 'interval')} {apart} exclude 0, by chance alone at least "
+            f"by {entry}: {count_noun(rows['group'].nunique(), 'group')} looked at; of "
+            f"{count_noun(len(limited), 'interval')} {off_zero} exclude 0, by chance alone at least "
             f"{(1 - CONFIDENCE) * len(limited):.2g} would; {int((limited['star'] == STAR).sum())} with a {STAR}, all "
             "groups held at 95 % together"
         )

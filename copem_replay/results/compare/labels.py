@@ -33,19 +33,19 @@ _SHOWN = 12
 
 
 def log_keys(first: Results, other: Results) -> tuple[dict[tuple[str, int], RecordedLog], ...]:
-    """The logs of two folders by the digest of their truth, and a number of those that share it, by name."""
-    found: list[dict[tuple[str, int], RecordedLog]] = []
+    """By name of a log the digest of its truth, and its number among the logs with an equal one."""
+    logs_of: list[dict[tuple[str, int], RecordedLog]] = []
     for folder in (first, other):
         times = Counter[str]()
-        found.append({})
+        logs_of.append({})
         for log in sorted(folder.provenance.logs, key=lambda log: log.name):
-            found[-1][log.truth, times[log.truth]] = log
+            logs_of[-1][log.truth, times[log.truth]] = log
             times[log.truth] += 1
-    return tuple(found)
+    return tuple(logs_of)
 
 
 def rename_logs(folders: Sequence[Results]) -> tuple[list[Results], dict[Results, dict[str, str]]]:
-    """The folders with logs named as in the first one; by folder the old names of renamed logs, by their new names."""
+    """The folders with logs named as in the first; and by folder the old names of renamed logs, by new name."""
     renamed, names = [folders[0]], {}
     for other in folders[1:]:
         first, second = log_keys(folders[0], other)
@@ -67,18 +67,18 @@ def _replace_log_names(results: Results, to: Mapping[str, str]) -> Results:
 def check_log_names(pairs: Pairs, names: Mapping[Results, Mapping[str, str]]) -> None:
     """Raise InputError, a line for every log of another name, where random draws are compared."""
     problems: list[str] = []
-    for labelled, against in pairs.items():
-        own_names, theirs = names.get(labelled.results, {}), names.get(against.results, {})
-        if own_names == theirs or (_is_same_in_every_run(labelled) and _is_same_in_every_run(against)):
+    for labelled, baseline in pairs.items():
+        own_names, theirs = names.get(labelled.results, {}), names.get(baseline.results, {})
+        if own_names == theirs or (_is_same_in_every_run(labelled) and _is_same_in_every_run(baseline)):
             continue
         for log in sorted({*own_names, *theirs}):
-            found, expected = own_names.get(log, log), theirs.get(log, log)
+            name, expected = own_names.get(log, log), theirs.get(log, log)
             problem = (
-                f"{labelled.results.place}: log {found}: expected the name {expected} as in "
-                f"{against.results.place}, for what is drawn depends on it; run it again with "
+                f"{labelled.results.place}: log {name}: expected the name {expected} as in "
+                f"{baseline.results.place}, for what is drawn depends on it; run it again with "
                 f"`logs: [{{file: …, name: {expected}}}]`"
             )
-            problems += [] if found == expected or problem in problems else [problem]
+            problems += [] if name == expected or problem in problems else [problem]
     if problems:
         raise InputError(problems)
 
@@ -183,11 +183,11 @@ def _find_problems(first: Results, other: Results) -> Iterator[str]:
             yield from _describe_mismatch(first, other, "measure.conflict", *conflicts)
 
 
-def _describe_mismatch(first: Results, other: Results, key: str, expected: object, found: object) -> Iterator[str]:
-    if expected != found:
+def _describe_mismatch(first: Results, other: Results, key: str, expected: object, actual: object) -> Iterator[str]:
+    if expected != actual:
         yield (
             f"{other.place}: {key}: expected {json.dumps(expected, ensure_ascii=False)} as in {first.place}, found "
-            f"{json.dumps(found, ensure_ascii=False)}"
+            f"{json.dumps(actual, ensure_ascii=False)}"
         )
 
 
@@ -231,7 +231,7 @@ IDEAL_NAME = "ideal"
 
 
 class Baseline(NamedTuple):
-    """The baseline of an experiment where none is asked for. `why`: in words."""
+    """The default baseline of an experiment. `why`: the reason in words."""
 
     name: str
     why: str
@@ -253,7 +253,7 @@ def find_baseline(facts: Mapping[str, ConfigurationFacts], names: Sequence[str])
 
 
 def find_alone(results: Results, names: Sequence[str]) -> str | None:
-    """Of `names` the configuration of the car alone: units on the ego only; a real fusion rather than an ideal one.
+    """The configuration of the car alone among `names`: units on the ego only; a real fusion before an ideal one.
 
     Where no unit is on the ego it is the best with one unit. None: there is none.
     """
@@ -261,11 +261,11 @@ def find_alone(results: Results, names: Sequence[str]) -> str | None:
     on_ego = {unit for unit, of in experiment.units.items() if of.on == "ego"}
     units_of = {name: set(experiment.units_of(experiment.configurations[name])) for name in names}
     if on_ego:
-        own = [name for name, units in units_of.items() if units and units <= on_ego]
-        return next(iter([*(name for name in own if not results.facts[name].by_truth_id), *own]), None)
+        alone = [name for name, units in units_of.items() if units and units <= on_ego]
+        return next(iter([*(name for name in alone if not results.facts[name].by_truth_id), *alone]), None)
     mean_s = results.summary.set_index("configuration")["ttd_rmst_s"].astype(float)
-    own = [name for name, units in units_of.items() if len(units) == 1 and not np.isnan(mean_s[name])]
-    return min(own, key=lambda name: mean_s[name], default=None)
+    alone = [name for name, units in units_of.items() if len(units) == 1 and not np.isnan(mean_s[name])]
+    return min(alone, key=lambda name: mean_s[name], default=None)
 
 
 def notes_on_output_baseline(pairs: Pairs) -> Iterator[str]:
@@ -281,7 +281,7 @@ def notes_on_output_baseline(pairs: Pairs) -> Iterator[str]:
 
 
 def find_remembering(known: Sequence[LabelledConfiguration], pairs: Pairs) -> Pairs:
-    """The ideal fusions with memory that accuracy is held against, of configurations that remember.
+    """By configuration with memory the ideal fusion with memory that its accuracy is compared with.
 
     Those whose baseline is their own ideal.
     """
@@ -338,7 +338,7 @@ def label_configurations(folders: Sequence[Results]) -> list[LabelledConfigurati
 
 
 def name_folders(folders: Sequence[Results]) -> list[str]:
-    """The names of folders, by which labels tell them apart: paths where names are the same."""
+    """Distinct names of folders, for labels: paths where names are the same."""
     times = Counter(folder.name for folder in folders)
     return [folder.name if times[folder.name] == 1 else str(folder.place) for folder in folders]
 
@@ -351,46 +351,46 @@ def _configuration_names(results: Results) -> list[str]:
 def pair_configurations(
     folders: Sequence[Results], configurations: Sequence[str] | None, baseline: str | None
 ) -> dict[LabelledConfiguration, LabelledConfiguration]:
-    """The configurations to compare, each once, with what each is held against. Raises InputError.
+    """The configurations to compare, each once, with the baseline of each. Raises InputError.
 
     `configurations`: names, of which one that several folders have stands for all of them; None: all. `baseline`: a
     name that is one configuration; None: of one folder that of `find_baseline`, of several each against itself in the
     first folder.
     """
     known = label_configurations(folders)
-    wanted: list[LabelledConfiguration] = list(known) if configurations is None else []
+    chosen: list[LabelledConfiguration] = list(known) if configurations is None else []
     problems = []
     for name in configurations or ():
-        meant = _find_meant(known, name)
-        wanted += meant
-        if not meant:
+        matching = _find_meant(known, name)
+        chosen += matching
+        if not matching:
             hint = unknown_name_message("configuration", name, dict.fromkeys(one.configuration for one in known))
             problems.append(f"--configurations: {hint}")
     if problems:
         raise InputError(problems)
     if baseline is None and len(folders) > 1:
-        return _pair_with_first(folders, known, wanted)
+        return _pair_with_first(folders, known, chosen)
     if baseline is None:
         baseline = find_baseline(folders[0].facts, [labelled.configuration for labelled in known]).name
-    against = _find_named_baseline(known, baseline)
-    others = [labelled for labelled in dict.fromkeys(wanted) if labelled is not against]
+    reference = _find_named_baseline(known, baseline)
+    others = [labelled for labelled in dict.fromkeys(chosen) if labelled is not reference]
     if not others:
-        raise InputError(f"compare: expected a configuration beside the baseline {against.label}, found none")
-    return dict.fromkeys(others, against)
+        raise InputError(f"compare: expected a configuration beside the baseline {reference.label}, found none")
+    return dict.fromkeys(others, reference)
 
 
 def _pair_with_first(
-    folders: Sequence[Results], known: Sequence[LabelledConfiguration], wanted: Sequence[LabelledConfiguration]
+    folders: Sequence[Results], known: Sequence[LabelledConfiguration], chosen: Sequence[LabelledConfiguration]
 ) -> dict[LabelledConfiguration, LabelledConfiguration]:
     """Configurations of later folders, each with itself in the first one. Raises InputError where there is none."""
     old = {labelled.configuration: labelled for labelled in known if labelled.results is folders[0]}
-    later = [labelled for labelled in dict.fromkeys(wanted) if labelled.results is not folders[0]]
+    later = [labelled for labelled in dict.fromkeys(chosen) if labelled.results is not folders[0]]
     pairs = {labelled: old[labelled.configuration] for labelled in later if labelled.configuration in old}
     if not pairs:
-        found = ", ".join(dict.fromkeys(labelled.configuration for labelled in later)) or "none"
+        names = ", ".join(dict.fromkeys(labelled.configuration for labelled in later)) or "none"
         raise InputError(
             f"compare: expected a configuration of {folders[0].place} ({', '.join(old)}) in a later folder, found "
-            f"{found}; --baseline NAME holds all against one"
+            f"{names}; --baseline NAME holds all against one"
         )
     return pairs
 
@@ -412,11 +412,11 @@ def _find_meant(known: Sequence[LabelledConfiguration], name: str) -> list[Label
 
 
 def _find_named_baseline(known: Sequence[LabelledConfiguration], name: str) -> LabelledConfiguration:
-    meant = _find_meant(known, name)
-    if len(meant) == 1:
-        return meant[0]
-    if meant:
-        several = ", ".join(labelled.label for labelled in meant)
-        raise InputError(f"--baseline: expected one of {several}, found {meant[0].configuration}, which may be any")
+    matching = _find_meant(known, name)
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        several = ", ".join(labelled.label for labelled in matching)
+        raise InputError(f"--baseline: expected one of {several}, found {matching[0].configuration}, which may be any")
     hint = unknown_name_message("configuration", name, [labelled.label for labelled in known])
     raise InputError(f"--baseline: {hint}")

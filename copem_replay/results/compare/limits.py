@@ -84,11 +84,11 @@ class StatisticItems:
 
     @property
     def weight(self) -> Float:
-        """(i,) what an item counts in means and medians: its pairs, where no drive is to count as much as another."""
+        """(i,) the weight of an item in means and medians: its number of pairs, unless drives weigh alike."""
         return self.columns.get("weight", self["n"]).astype(float)
 
     def each_drive_once(self) -> StatisticItems:
-        """The items with a weight by which each log counts as much as another."""
+        """The items with weights by which each log counts the same."""
         sums = self.columns.get("sums")
         averaged = self["n"].astype(float) if sums is None else sums[:, 2]
         of_log = np.bincount(self["logs"], averaged)
@@ -98,7 +98,7 @@ class StatisticItems:
 
     @staticmethod
     def joined(parts: Sequence[StatisticItems]) -> StatisticItems:
-        """The items of several logs together."""
+        """The items of several logs in one."""
         return StatisticItems({name: np.concatenate([part[name] for part in parts]) for name in parts[0].columns})
 
 
@@ -110,7 +110,7 @@ def _sum_groups(values: NDArray[Any], group: Int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class ClusterNames:
-    """The names that logs, objects and runs of items count in; passes are numbers."""
+    """The names of logs, objects and runs, to which the numbers of items refer; passes are numbers."""
 
     logs: Sequence[str]
     objects: list[str]  # log and id, separated by a line feed
@@ -151,7 +151,7 @@ class ClusterIndex:
 
 
 def index_clusters(items: StatisticItems, over: str, names: ClusterNames) -> ClusterIndex | None:
-    """The logs, objects, passes or runs with items, in the order of their names; None: too few have the figure."""
+    """The clusters of items: logs, objects, passes or runs, by name in order; None: too few have the figure."""
     numbers = [str(k) for k in range(max(names.runs, int(items["passes"].max(initial=-1)) + 1))]
     all_names = {"logs": names.logs, "objects": names.objects}.get(over, numbers)
     present = sorted(np.unique(items[over][items[over] >= 0]).tolist(), key=lambda k: all_names[k])
@@ -213,30 +213,30 @@ class PairStatistic(ABC):
         return replace(logs[0], parts=tuple(map(StatisticItems.joined, zip(*(log.parts for log in logs), strict=True))))
 
     def each_drive_once(self) -> Self:
-        """The figure in which each log counts as much as another."""
+        """The figure with weights by which each log counts the same."""
         return replace(self, parts=tuple(part.each_drive_once() for part in self.parts))
 
     @abstractmethod
     def values(self) -> tuple[float, float, float]:
-        """The figure of the first, of the second, and their difference; NaN or infinite: there is none."""
+        """The figure of the first, of the second, and their difference; NaN or infinite: undefined."""
 
     @abstractmethod
     def without_each(self, clusters: ClusterIndex) -> Float:
         """(K,) differences without the items of each cluster."""
 
     def weights(self, clusters: ClusterIndex) -> Float:
-        """(K,) how much of what the figure averages each cluster has: as many pairs."""
+        """(K,) the weight of each cluster in the figure's average: its number of pairs."""
         cluster, n = clusters.of(self.items), self.items.weight
         return np.bincount(cluster[cluster >= 0], n[cluster >= 0], len(clusters.names)).astype(float)
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The least and the most that the difference can be."""
+        """The least and the greatest possible difference."""
         return -math.inf, math.inf
 
     @property
     def followed(self) -> float:
-        """The share of the pairs whose values are known up to the bounds."""
+        """The share of pairs whose values are known up to the bounds."""
         return 1.0
 
     def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
@@ -252,7 +252,7 @@ class PairStatistic(ABC):
     def limit_by_bounds(
         self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE
     ) -> LimitedFigure:
-        """The difference with the limits of a mean between bounds, of which a criterion is met; else without."""
+        """The difference with limits of a mean between bounds, by which a criterion can be met; else without limits."""
         if not np.isfinite(self.bounds).all() or not self.followed:
             return LimitedFigure(difference)
         of, each = clusters.grouped, self.weights(clusters)
@@ -271,7 +271,7 @@ class SumStatistic(PairStatistic):
     most: float = math.inf
 
     def values(self) -> tuple[float, float, float]:
-        """Of the first, of the second, and their difference."""
+        """The figure of the first, of the second, and their difference."""
         with np.errstate(divide="ignore", invalid="ignore"):  # division by 0: there is no figure
             first, second = self.of(self.items["sums"].sum(axis=0))
             return float(first), float(second), float(first - second)
@@ -284,20 +284,20 @@ class SumStatistic(PairStatistic):
         return np.stack(columns, axis=1), sums[~within].sum(axis=0)
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) differences. Items of no cluster stay, and the other clusters count for the one that is left out."""
+        """(K,) differences without each cluster, for which the others count. Items of no cluster stay."""
         by_cluster, always = self._sums_by_cluster(clusters)
-        rest = by_cluster.sum(axis=0) - by_cluster
+        sums = by_cluster.sum(axis=0) - by_cluster
         if always.any():
             weights = clusters.count_objects(self.items)
             total = weights.sum()
-            rest = rest * (total / np.where(weights < total, total - weights, total))[:, None] + always
+            sums = sums * (total / np.where(weights < total, total - weights, total))[:, None] + always
         with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = self.of(rest)
+            first, second = self.of(sums)
             difference: Float = first - second
         return difference
 
     def weights(self, clusters: ClusterIndex) -> Float:
-        """(K,) what the figure averages over in each cluster; objects where some of it is in none."""
+        """(K,) the weight of each cluster in the figure's average; objects where some of it belongs to no cluster."""
         by_cluster, always = self._sums_by_cluster(clusters)
         weights: Float = clusters.count_objects(self.items) if always.any() else by_cluster[:, 2]
         return weights
@@ -310,7 +310,7 @@ class SumStatistic(PairStatistic):
 
 @dataclass(frozen=True, kw_only=True)
 class MedianStatistic(PairStatistic):
-    """Medians of the items' `first` and `second`, that may be −∞, and the median of their differences, pair by pair."""
+    """Medians of the items' `first` and `second`, which may be −∞, and the median of their pairwise differences."""
 
     @property
     def differences(self) -> Float:
@@ -328,7 +328,7 @@ class MedianStatistic(PairStatistic):
         return first, second, difference
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) medians of the differences."""
+        """(K,) medians of the differences without each cluster."""
         cluster, n = clusters.of(self.items), self.items.weight
         medians = [
             _weighted_median(self.differences[cluster != k], n[cluster != k]) for k in range(len(clusters.names))
@@ -336,7 +336,7 @@ class MedianStatistic(PairStatistic):
         return np.array(medians)
 
     def limits(self, difference: float, clusters: ClusterIndex, confidence: float = CONFIDENCE) -> LimitedFigure:
-        """Limits of the share of differences at or below a value, inverted."""
+        """Limits of the median: those of the share of differences at or below a value, inverted."""
         cluster, n = clusters.of(self.items), self.items.weight
         objects = None if clusters.over == "runs" else clusters.count_objects(self.items).sum()
         once = clusters.over == "logs" and "weight" in self.items.columns
@@ -360,7 +360,7 @@ class TimeStatistic(PairStatistic):
     horizon_s: float
 
     def values(self) -> tuple[float, float, float]:
-        """Of the first, of the second, and their difference."""
+        """The restricted mean of the first, of the second, and their difference."""
         if not len(self.items["n"]):
             return math.nan, math.nan, math.nan
         sides = [0.0, 0.0]
@@ -370,7 +370,7 @@ class TimeStatistic(PairStatistic):
         return sides[0], sides[1], sides[0] - sides[1]
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) differences."""
+        """(K,) differences of the restricted means without each cluster."""
         K, sides = len(clusters.names), np.zeros((2, len(clusters.names)))
         for share, part in zip(self.shares, self.parts, strict=True):
             means = restricted_means_without(
@@ -382,13 +382,13 @@ class TimeStatistic(PairStatistic):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """As far apart as never is from the earliest time."""
+        """The greatest possible difference, from the earliest time to never, with either sign."""
         earliest = min((float(part["time_s"].min(initial=0.0)) for part in self.parts), default=0.0)
         return min(earliest, self.horizon_s) - self.horizon_s, self.horizon_s - min(earliest, self.horizon_s)
 
     @property
     def followed(self) -> float:
-        """The share of the pairs that is detected, departed or watched to the horizon, on the side that has fewer."""
+        """The share of pairs detected, departed or observed to the horizon, on the side where it is less."""
         known = [(of["ending"] != CENSORED) | (of["time_s"] >= self.horizon_s - _SAME) for of in self.parts]
         return min(float(of.weight[kept].sum() / of.weight.sum()) for of, kept in zip(self.parts, known, strict=True))
 
@@ -405,7 +405,7 @@ _SAME = 1e-9
 
 
 def find_decisive_log(figure: PairStatistic, difference: float, names: ClusterNames) -> tuple[str, float] | None:
-    """The log without which the difference turns its sign or is at most half, and the difference then; None: no log.
+    """The log without which the difference turns its sign or halves, and the difference then; None: no log.
 
     Of several the one that changes it most.
     """
@@ -434,16 +434,16 @@ def difference_limits(
     clusters = index_clusters(figure.items, over, names)
     if clusters is None or not (figure.by_object or over not in ("objects", "passes")):
         return {}
-    found = figure.limits(difference, clusters, confidence)
+    interval = figure.limits(difference, clusters, confidence)
     bounded = LimitedFigure(difference) if over == "runs" else figure.limit_by_bounds(difference, clusters, confidence)
     limits = {"low_bounded": bounded.low, "high_bounded": bounded.high} if bounded.kind else {}
-    if found.kind == ALL_ALIKE:
-        return {"interval": found.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
-    if not (math.isfinite(found.low) or math.isfinite(found.high)):
+    if interval.kind == ALL_ALIKE:
+        return {"interval": interval.kind, **limits, **({"clusters": len(clusters.names)} if limits else {})}
+    if not (math.isfinite(interval.low) or math.isfinite(interval.high)):
         return {}
-    limits |= {"low": found.low, "high": found.high}
+    limits |= {"low": interval.low, "high": interval.high}
     return {name: limit if math.isfinite(limit) else None for name, limit in limits.items()} | {
-        "interval": found.kind,
+        "interval": interval.kind,
         "interval_over": over,
         "clusters": len(clusters.names),
     }
@@ -472,18 +472,18 @@ def find_stars(number: int, limit: Sequence[Callable[[float], Mapping[str, objec
 
     Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6 (1979) 65–70.
     """
-    held: set[int] = set()
-    while len(held) < number:
-        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(held))
-        more = {k for k, at in enumerate(limit) if k not in held and is_off_zero(at(level))}
-        if not more:
+    starred: set[int] = set()
+    while len(starred) < number:
+        level = 1.0 - (1.0 - CONFIDENCE) / (number - len(starred))
+        added = {k for k, at in enumerate(limit) if k not in starred and is_off_zero(at(level))}
+        if not added:
             break
-        held |= more
-    return held
+        starred |= added
+    return starred
 
 
 def describe_difference(row: Mapping[str, Any], better: int, least: float) -> str:
-    """The word of a row with its star: `alike` where its interval is within ± `least`, what matters."""
+    """The word of a row with its star: `alike` where its interval is within ± `least`, the least that matters."""
     if row.get("star") == STAR:
         return BETTER if row["difference"] * better > 0 else WORSE
     low, high = row.get("low"), row.get("high")

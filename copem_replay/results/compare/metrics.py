@@ -82,12 +82,12 @@ class GhostTotals:
 
     @property
     def per_min(self) -> float | None:
-        """Ghosts per minute at the lowest existence; None: not known."""
+        """Ghosts per minute at the lowest existence; None: unknown."""
         return float(self.at[0]) / self.minutes if len(self.existence) and self.minutes > 0 else None
 
     @property
     def tells_apart(self) -> bool:
-        """Whether any threshold leaves out some of the entries but not all."""
+        """Whether any threshold of existence removes some entries, but not all."""
         all_left = (self.at == self.at[:1]) & (self.least >= self.existence)
         none_left = (self.at == 0) & (self.most < self.existence)
         return not (all_left | none_left).all()
@@ -95,7 +95,7 @@ class GhostTotals:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Entries of at least `existence` are listed in a share of the drives, in the rest those of at least `above`."""
+    """Thresholds of existence: `existence` in a share of the drives, `above` in the rest."""
 
     existence: float
     above: float  # inf: nothing
@@ -124,7 +124,7 @@ def _add_log(
 ) -> GhostTotals:
     """The totals of the earlier logs and of one more, in the first `runs` runs."""
     lengths, existence = list_column(rows["existence"])
-    counts, at = list_column(rows["ghosts_at"])
+    counts, ghosts_at = list_column(rows["ghosts_at"])
     thresholds = existence[: lengths[0]] if len(lengths) else existence
     if before is not None and len(before.existence):
         thresholds = before.existence if len(lengths) else thresholds
@@ -137,7 +137,7 @@ def _add_log(
         )
     compared = integer_column(rows["run"], missing=runs) < runs
     minutes = float(float_column(rows["minutes"])[compared].sum())
-    ghosts = at.reshape(size)[compared].sum(axis=0).astype(np.int64)
+    ghosts = ghosts_at.reshape(size)[compared].sum(axis=0).astype(np.int64)
     steps_at = float_column(steps["existence"])[integer_column(steps["run"], missing=runs) < runs]
     least, most = float(steps_at.min(initial=np.inf)), float(steps_at.max(initial=-np.inf))
     if before is None or not len(before.existence):
@@ -148,7 +148,7 @@ def _add_log(
 
 
 def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint | None:
-    """The operating point with `per_min` ghosts, fewer where all entries make fewer; None: the rate is not known."""
+    """The operating point with `per_min` ghosts, fewer where all entries make fewer; None: unknown."""
     if ghosts.per_min is None:
         return None
     rates = np.append(ghosts.at / ghosts.minutes, 0.0)
@@ -163,7 +163,7 @@ def find_operating_point(ghosts: GhostTotals, per_min: float) -> OperatingPoint 
 def find_operating_points(
     first: GhostTotals | None, second: GhostTotals | None, per_min: float | None
 ) -> tuple[OperatingPoint, OperatingPoint] | None:
-    """The operating points of both sides; None: one is not known."""
+    """The operating points of both sides; None: one is unknown."""
     if first is None or second is None or per_min is None:
         return None
     kept = find_operating_point(first, per_min), find_operating_point(second, per_min)
@@ -171,26 +171,25 @@ def find_operating_points(
 
 
 def explain_incomparable(
-    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None, *, asked: bool, truth: bool
+    first: GhostTotals | None, second: GhostTotals | None, per_min: float | None, *, by_user: bool, truth: bool
 ) -> str | None:
     """Why the times of two sides at `per_min` ghosts cannot be compared; None: they can, or there are none.
 
-    `asked`: whether the user asked for the rate; else it is the second side's own. `truth`: whether the second side is
-    the truth.
+    `by_user`: the user asked for the rate; else it is the second side's own. `truth`: the second side is the truth.
     """
     if per_min is None or first is None or second is None:
         return None
     if truth:
         return TRUTH
-    if not asked and second.at[:1].sum() < FEWEST_GHOSTS:
+    if not by_user and second.at[:1].sum() < FEWEST_GHOSTS:
         return FEW
     for side in (first, second):
-        kept = find_operating_point(side, per_min)
-        if side.per_min is None or kept is None or side.per_min <= per_min * (1 + 1e-9):
+        point = find_operating_point(side, per_min)
+        if side.per_min is None or point is None or side.per_min <= per_min * (1 + 1e-9):
             continue
         if not side.tells_apart:
             return ONE_VALUE if side is first else f"of the baseline, {ONE_VALUE}"
-        if kept.false_positives_per_min * side.minutes < FEWEST_GHOSTS * (1 - 1e-9):
+        if point.false_positives_per_min * side.minutes < FEWEST_GHOSTS * (1 - 1e-9):
             return FEW
     return None
 
@@ -213,7 +212,7 @@ class PairSettings:
 
 @dataclass(frozen=True)
 class HeldCounts:
-    """What is said beside figures of what both hold; counts of several logs add up. (2,): of the first, of the second.
+    """Counts beside figures of held lists; those of several logs add up. (2,): of the first, of the second.
 
     `frames`: object frames are not counted twice: a frame of a run counts once. `without_truth` is over all frames.
     """
@@ -229,7 +228,7 @@ class HeldCounts:
         return HeldCounts(*(getattr(self, of.name) + getattr(other, of.name) for of in fields(HeldCounts)))
 
     def columns(self) -> dict[str, object]:
-        """The columns of a comparison with these counts."""
+        """The counts as columns of a comparison."""
         columns: dict[str, object] = {"frames": self.frames}
         for k, (name, only) in enumerate((("", "only_configuration"), ("baseline_", "only_baseline"))):
             columns[only] = int(self.only[k])
@@ -241,9 +240,9 @@ class HeldCounts:
 
 @dataclass(frozen=True)
 class Regret:
-    """A metric of a pair; `counts`: by log the numbers of objects and of passes of which both sides have rows.
+    """A metric of a pair; `counts`: by log the number of objects and of passes with rows on both sides.
 
-    `kept`: operating points of the first and the second, for times at equal ghosts. `held`: beside what both hold.
+    `kept`: operating points of the first and the second, for times at equal ghosts. `held`: counts of held lists.
     """
 
     metric: str
@@ -254,7 +253,7 @@ class Regret:
 
     @property
     def over(self) -> str | None:
-        """The clusters of its interval; None: there are too few."""
+        """The unit of its interval; None: there are too few."""
         return choose_over(*total_counts(self.counts))
 
     @staticmethod
@@ -267,7 +266,7 @@ class Regret:
 
 
 def total_counts(counts: Iterable[tuple[int, int]]) -> tuple[int, int, int]:
-    """How many logs have objects, and how many objects and passes there are, from those of each log."""
+    """The number of logs with objects, of objects and of passes, over all logs."""
     some = [of_log for of_log in counts if of_log[0]]
     return len(some), sum(objects for objects, _ in some), sum(passes for _, passes in some)
 
@@ -314,9 +313,9 @@ class _Pair:
 
 
 def compute_regrets(
-    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, only: Sequence[str] | None = None
+    first: PairSide, second: PairSide, grid: PairingGrid, setting: PairSettings, metrics: Sequence[str] | None = None
 ) -> Iterator[Regret]:
-    """The metrics of a log, all or `only` some, for which both sides have the data.
+    """The metrics of a log, all or `metrics` some, for which both sides have the data.
 
     Those of lists are over all rows that both sides have, the others over those that count.
     """
@@ -326,16 +325,16 @@ def compute_regrets(
         counts = len(np.unique(grid.object_of(pair.cells))), len(np.unique(pair.cells // grid.runs))
         pairs.append((pair, counts))
     for metric in COMPARED.values():
-        of = metric.compared
-        if of is None or (only is not None and metric.name not in only):
+        compared = metric.compared
+        if compared is None or (metrics is not None and metric.name not in metrics):
             continue
         pair, counts = pairs[0 if metric.part in OF_LISTS else 1]
-        figure = FIGURES[of.figure](pair) if isinstance(of.figure, str) else _means(pair, of.figure)
+        figure = FIGURES[compared.figure](pair) if isinstance(compared.figure, str) else _means(pair, compared.figure)
         if figure is not None:
-            held = pair.held_counts if FIGURES.get(of.figure) in (_held_errors, _held_gospa) else None
-            kept = pair.setting.kept if FIGURES.get(of.figure) is _means_at_equal_ghosts else None
+            held = pair.held_counts if FIGURES.get(compared.figure) in (_held_errors, _held_gospa) else None
+            points = pair.setting.kept if FIGURES.get(compared.figure) is _means_at_equal_ghosts else None
             counts = (1, 1) if metric.part == "needless" else counts  # a drive is one, whatever objects it has
-            yield Regret(metric.name, figure, (counts,), kept, held)
+            yield Regret(metric.name, figure, (counts,), points, held)
 
 
 def _means(pair: _Pair, values: Callable[[Columns], NDArray[Any]]) -> SumStatistic:
@@ -365,11 +364,11 @@ def _passes(pair: _Pair) -> SumStatistic | None:
 def _means_where_both_detect(pair: _Pair) -> SumStatistic:
     """Mean times to detection of the cells that both sides detect; `only`: the cells that one side alone does."""
     first, second = (side.rows["detected"][pair.cells] for side in pair.sides)
-    both = first & second
+    both_detect = first & second
     times_s = ((side.rows["detection_s"] - side.rows["onset_s"])[pair.cells] for side in pair.sides)
-    sums = np.stack([*(np.where(both, time_s, 0.0) for time_s in times_s), both.astype(float)], axis=1)
+    sums = np.stack([*(np.where(both_detect, time_s, 0.0) for time_s in times_s), both_detect.astype(float)], axis=1)
     only = np.stack([first & ~second, second & ~first], axis=1).astype(np.int64)
-    items = pair.items(pair.cells, n=both.astype(np.int64), only=only, sums=sums)
+    items = pair.items(pair.cells, n=both_detect.astype(np.int64), only=only, sums=sums)
     return SumStatistic(parts=(items,), of=_divide_mean)
 
 
@@ -436,21 +435,21 @@ HELD_METRICS = ("position_rmse_held_m", "gospa_held_m")
 
 
 def _held_errors(pair: _Pair) -> SumStatistic | None:
-    if (both := pair.held) is None:
+    if (held := pair.held) is None:
         return None
-    paired = both.pairs > 0
-    squares = np.concatenate([both.squared_m2, both.pairs[:, None]], axis=1)[paired]
-    items = pair.items(pair.cells[paired], n=both.pairs[paired], sums=squares)
+    paired = held.pairs > 0
+    squares = np.concatenate([held.squared_m2, held.pairs[:, None]], axis=1)[paired]
+    items = pair.items(pair.cells[paired], n=held.pairs[paired], sums=squares)
     return SumStatistic(parts=(items,), of=_make_power_mean(2.0))
 
 
 def _held_gospa(pair: _Pair) -> SumStatistic | None:
     """GOSPA of frames, which belong to no object, so that their number stays where objects are clusters."""
-    if (both := pair.held) is None:
+    if (held := pair.held) is None:
         return None
-    measured = both.measured > 0
-    parts = np.concatenate([both.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
-    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(both.frames, [0.0, 0.0, 1.0]), both.frames)
+    measured = held.measured > 0
+    parts = np.concatenate([held.gospa, np.zeros((len(pair.cells), 1))], axis=1)[measured]
+    items = _append_run_items(pair, pair.cells[measured], parts, np.outer(held.frames, [0.0, 0.0, 1.0]), held.frames)
     return SumStatistic(parts=(items,), of=_make_power_mean(pair.setting.power))
 
 
@@ -462,13 +461,13 @@ def _ghost_rates(pair: _Pair) -> SumStatistic | None:
     present, runs = first["there"] & second["there"], pair.cells % pair.grid.runs
     cells, runs = pair.cells[present[runs]], runs[present[runs]]
     nearest = np.zeros((len(cells), 4))
-    rest = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
-    rest[~present] = 0.0
+    per_run = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
+    per_run[~present] = 0.0
     accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
     for k, accuracy_of_side in enumerate(accuracy if len(accuracy) == 2 else ()):
         nearest[:, k] = accuracy_of_side.ghosts[cells]
-        rest[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(rest))
-    items = _append_run_items(pair, cells, nearest, rest, present.astype(np.int64))
+        per_run[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(per_run))
+    items = _append_run_items(pair, cells, nearest, per_run, present.astype(np.int64))
     return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 

@@ -116,7 +116,7 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True)
 class AccuracyData:
-    """Accuracy of a configuration: each cell has `length` frames from frame `first` on, at `start` in values.
+    """Accuracy of a configuration: each cell has `length` frames from frame `first` on, at `start` in the values.
 
     What is held at frames is equal in all runs unless runs differ in their units: run s has row `of_run[s]`.
     """
@@ -157,11 +157,11 @@ class PairSide:
 
     @property
     def counted_however_begun(self) -> Bool:
-        """There, and counted if all did, however they began."""
+        """The mask of rows that would count whatever `measure.began` says."""
         return self.there & (self.rows["ended_s"] - self.rows["onset_s"] > SAME_INSTANT_S)
 
     def has_rows_of(self, other: PairSide) -> bool:
-        """Whether all rows, and all lists by their counts, say the same on another side, as far as both are written."""
+        """Whether the other side has equal rows, and equal counts of lists, as far as both are written."""
         if not np.array_equal(self.there, other.there):
             return False
         pairs = [(of[self.there], other.rows[name][self.there]) for name, of in self.rows.items() if name in other.rows]
@@ -248,16 +248,16 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
 def _read_frames(place: Path, rows: pa.Table, grid: PairingGrid) -> tuple[Float, Int, Bool, Int]:
     """`frame_s`, `begins`, `holds` and `of_run` of `AccuracyData`; the last row holds nothing, for runs without one."""
     counts, every_s = list_column(rows["frame_s"])
-    numbers, held = list_column(rows["held_list"])
+    numbers, held_list = list_column(rows["held_list"])
     issued, available_s = list_column(rows["available_s"])
     frames = int(counts[0]) if len(counts) else 0
-    same = (counts == frames).all() and (numbers == frames).all()
-    if not same or (every_s.reshape(len(counts), frames) != every_s[:frames]).any():
+    consistent = (counts == frames).all() and (numbers == frames).all()
+    if not consistent or (every_s.reshape(len(counts), frames) != every_s[:frames]).any():
         raise InputError(f"{place}: expected the same frame_s in all rows of a log, and as many held_list; {AGAIN}")
     frame_s = every_s[:frames]
     first_s = np.append(available_s, np.inf)[np.where(issued > 0, np.cumsum(issued) - issued, len(available_s))]
     begins = np.searchsorted(frame_s, first_s - SAME_INSTANT_S, side="left")
-    holds = np.concatenate([~np.isnan(held).reshape(len(counts), frames), np.zeros((1, frames), dtype=bool)])
+    holds = np.concatenate([~np.isnan(held_list).reshape(len(counts), frames), np.zeros((1, frames), dtype=bool)])
     by_run = "run" in rows.column_names
     of_run = np.full(grid.runs, -1 if by_run else len(counts) - 1)
     if by_run:
@@ -310,7 +310,7 @@ def pair_held_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid
     begins = np.maximum(*(side.begins[side.of_run] for side in sides))
     pairs, measured = np.zeros((2, len(cells)), dtype=np.int64)
     squared_m2, gospa = np.zeros((2, len(cells), 2))
-    age_s, only = np.zeros(2), np.zeros(2, dtype=np.int64)
+    age_s, one_sided = np.zeros(2), np.zeros(2, dtype=np.int64)
     counted = np.zeros((grid.runs, frames), dtype=bool)
     until = np.cumsum(first.length[cells])
     bounds = np.searchsorted(until, np.arange(_VALUES, int(until[-1]) if len(until) else 0, _VALUES))
@@ -319,19 +319,19 @@ def pair_held_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid
         errors_m = [side.error_m[k] for side, k in zip(sides, places, strict=True)]
         parts = [side.gospa[k] for side, k in zip(sides, places, strict=True)]
         listed = [~np.isnan(of) for of in errors_m]
-        both, counts = listed[0] & listed[1], ~np.isnan(parts[0] + parts[1])
-        pairs += np.bincount(row[both], minlength=len(cells))
+        both_list, counts = listed[0] & listed[1], ~np.isnan(parts[0] + parts[1])
+        pairs += np.bincount(row[both_list], minlength=len(cells))
         measured += np.bincount(row[counts], minlength=len(cells))
         for side in (0, 1):
-            squared_m2[:, side] += np.bincount(row[both], errors_m[side][both] ** 2, minlength=len(cells))
+            squared_m2[:, side] += np.bincount(row[both_list], errors_m[side][both_list] ** 2, minlength=len(cells))
             gospa[:, side] += np.bincount(row[counts], parts[side][counts], minlength=len(cells))
-            age_s[side] += sides[side].age_s[places[side][both]].sum()
-            only[side] += (listed[side] & ~both).sum()
+            age_s[side] += sides[side].age_s[places[side][both_list]].sum()
+            one_sided[side] += (listed[side] & ~both_list).sum()
         counted[cells[row[counts]] % grid.runs, frame[counts]] = True
-    without = np.zeros(2, dtype=np.int64)
+    missing = np.zeros(2, dtype=np.int64)
     if counted.any():  # a side that is not in the log has no frames
-        without[:] = [(counted & ~side.holds[side.of_run]).sum() for side in sides]
-    return PairedHeldSums(pairs, squared_m2, age_s, only, measured, gospa, counted.sum(axis=1), without)
+        missing[:] = [(counted & ~side.holds[side.of_run]).sum() for side in sides]
+    return PairedHeldSums(pairs, squared_m2, age_s, one_sided, measured, gospa, counted.sum(axis=1), missing)
 
 
 def _align_frames(
@@ -343,9 +343,9 @@ def _align_frames(
     """
     length = first.length[cells[part]]
     row = np.repeat(part, length)
-    within = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
+    offset = np.arange(len(row)) - np.repeat(np.cumsum(length) - length, length)
     cell = cells[row]
-    frame = first.first[cell] + within
-    kept = frame >= begins[row]
-    row, within, cell, frame = (values[kept] for values in (row, within, cell, frame))
-    return row, frame, (first.start[cell] + within, second.start[cell] + within)
+    frame = first.first[cell] + offset
+    counts = frame >= begins[row]
+    row, offset, cell, frame = (values[counts] for values in (row, offset, cell, frame))
+    return row, frame, (first.start[cell] + offset, second.start[cell] + offset)

@@ -63,15 +63,15 @@ def _group_blocks(comparison: Comparison, width: int | None) -> Iterator[str]:
         yield "\n".join([format_table(_format_groups(str(by), rows), width), *lines])
 
 
-def _format_groups(by: str, rows: pd.DataFrame) -> pd.DataFrame:
+def _format_groups(entry: str, rows: pd.DataFrame) -> pd.DataFrame:
     """The differences of each group and configuration as text; metrics that have none are left out."""
     names = [name for name in COMPARED if rows.loc[rows["metric"] == name, "difference"].notna().any()]
     cells: list[dict[str, str]] = []
     for (group, configuration), of_pair in rows.groupby(["group", "configuration"], sort=False):
-        found = {row.metric: row for row in of_pair.itertuples(index=False)}
-        figures = {name: _format_cell(found.get(name)) for name in names}
-        cells.append({by: str(group), "configuration": str(configuration), **figures})
-    return pd.DataFrame(cells, columns=[by, "configuration", *names])
+        row_of = {row.metric: row for row in of_pair.itertuples(index=False)}
+        figures = {name: _format_cell(row_of.get(name)) for name in names}
+        cells.append({entry: str(group), "configuration": str(configuration), **figures})
+    return pd.DataFrame(cells, columns=[entry, "configuration", *names])
 
 
 def comparison_markdown(comparison: Comparison) -> str:
@@ -79,13 +79,13 @@ def comparison_markdown(comparison: Comparison) -> str:
     comparison = comparison.changed
     held, notes = held_cells(comparison), (f"note: {note}" for note in comparison.notes)
     lines = [f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)]
-    beside = ["", *_markdown_rows(held)] if len(held) else []
+    below = ["", *_markdown_rows(held)] if len(held) else []
     if comparison.groups is not None:
         for by, rows in comparison.groups.groupby("by", sort=False):
             chance = (f"- {escape_markdown(line)}" for line in describe_group_chance(rows))
-            beside += ["", *_markdown_rows(_format_groups(str(by), rows)), "", *chance]
+            below += ["", *_markdown_rows(_format_groups(str(by), rows)), "", *chance]
     cells = [*_markdown_rows(_format_cells(comparison)), ""] if comparison.configurations else []
-    return "\n".join([*cells, *lines, *beside, ""])
+    return "\n".join([*cells, *lines, *below, ""])
 
 
 def _markdown_rows(cells: pd.DataFrame) -> Iterator[str]:
@@ -131,7 +131,7 @@ def _format_cells(comparison: Comparison) -> pd.DataFrame:
 
 
 def format_alone(comparison: Comparison, configuration: str) -> str:
-    """What `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)` of the rows; empty: nothing."""
+    """The shares that `ttd_both_s` leaves out: `(only it 5.4 %, only the baseline 0 %)`; empty: none."""
     of_pair = comparison.overall[comparison.overall["configuration"] == configuration].set_index("metric")
     if not {"ttd_both_s", "detected_share"} <= set(of_pair.index) or not of_pair.loc["detected_share", "n"]:
         return ""
@@ -198,16 +198,16 @@ def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]
     """Lines on the marks of a table, on what decides, and on what matters."""
     number = int(rows["difference"].notna().sum())
     decide = comparison.decide
-    asked = number if decide is None else int(rows.loc[rows["metric"] == decide, "difference"].notna().sum())
-    whole = f"the {count_noun(asked, 'difference')} of {'this table' if decide is None else decide} together"
+    decided = number if decide is None else int(rows.loc[rows["metric"] == decide, "difference"].notna().sum())
+    together = f"the {count_noun(decided, 'difference')} of {'this table' if decide is None else decide} together"
     if decide is not None:
         yield f"decided by {decide}, named beforehand: no other column has a {STAR}"
     if (rows["star"] == STAR).any():
-        yield f"{STAR}: the interval excludes 0, {whole} held at 95 %"
+        yield f"{STAR}: the interval excludes 0, {together} held at 95 %"
     if (rows["star"] == ALONE).any():
         yield f"{ALONE}: its own interval alone excludes 0; of {number} such 1 in 20 does by chance"
     over_logs = rows.loc[rows["interval_over"] == "logs", "clusters"]
-    if len(over_logs) and over_logs.max() == FEWEST_LOGS and asked > 1:
+    if len(over_logs) and over_logs.max() == FEWEST_LOGS and decided > 1:
         yield "three drives cannot star a table; name one figure (--decide METRIC), or record eight"
     for metric, least in comparison.matters.items():
         yield (
@@ -271,7 +271,7 @@ def _describe_held(comparison: Comparison) -> Iterator[str]:
 
 
 def held_cells(comparison: Comparison) -> pd.DataFrame:
-    """What `position_rmse_held_m` is over, a row per configuration, as text; no rows: it is not compared."""
+    """What `position_rmse_held_m` is over, as one row of text per configuration; no rows: it is not compared."""
     overall = comparison.overall
     rows = overall[(overall["metric"] == "position_rmse_held_m") & overall["frames"].notna()]
     columns: dict[str, list[str]] = {"configuration": list(rows["configuration"])}
@@ -294,7 +294,7 @@ _MARKDOWN = re.compile(r"[\\`*~|$]|(?<![^\W_])_|_(?![^\W_])|!(?=\[)|\](?=[(\[])|
 
 def escape_markdown(text: str) -> str:
     """Text on one line, escaped so that Markdown and its HTML show it unchanged."""
-    html = re.sub("[&<>]", lambda found: _HTML[found[0]], escape_unprintable(text))
+    html = re.sub("[&<>]", lambda match: _HTML[match[0]], escape_unprintable(text))
     return _MARKDOWN.sub(r"\\\g<0>", html)
 
 
