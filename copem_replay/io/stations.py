@@ -46,12 +46,12 @@ def place_on_earth(lists: DecodedLists, station: Station, frame: Frame | None, p
         at_m = frame.from_wgs84(places)
     except InputError as error:
         raise RecordingError("; ".join(error.problems), path=path, topic=topic) from None
-    turns = [np.deg2rad(frame.convergence_deg(*at)) - frame.yaw_rad for at in places]
+    turns = [np.deg2rad(frame.convergence_deg(*degrees)) - frame.yaw_rad for degrees in places]
     half, zero = np.array(turns, dtype=float) / 2, np.zeros(len(places))
     rotation = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
     placed = SampledPoses(np.ones(len(places), dtype=bool), np.column_stack([at_m, zero]), rotation)
     instant, values = np.repeat(place.reshape(-1), lists.columns.rows), lists.columns.values.copy()
-    values[:, :2] *= np.array([frame.scale(*at) for at in places], dtype=float)[instant, None]
+    values[:, :2] *= np.array([frame.scale(*degrees) for degrees in places], dtype=float)[instant, None]
     values, covariance = transform_rows(values, lists.covariance_m2, placed, instant)
     notes = (*lists.columns.notes, *find("no station", int((~known).sum())))
     return replace(lists, columns=replace(lists.columns, values=values, notes=notes), covariance_m2=covariance)
