@@ -234,13 +234,7 @@ def _list_row_files(study: StudyTables) -> list[str]:
 
 def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]] = ()) -> None:
     """Write the experiment and all tables, with paths as they are from a folder."""
-    experiment = study.experiment
-    data = resolve_sweep(experiment).as_written()
-    data["logs"] = log_entries(experiment.logs, study.recordings, folder)
-    for latency in _find_recorded_latencies(data):
-        latency["file"] = relative_path(latency["file"], folder)
-    for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
-        site["file"] = relative_path(site["file"], folder)
+    data = relocate_experiment(resolve_sweep(study.experiment), study.recordings, folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
     write_csv(study.summary, scratch / "summary.csv")
@@ -251,6 +245,17 @@ def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Seque
     for name, table in (("summary_by.csv", study.summary_by), ("bands.csv", study.bands), ("sweep.csv", study.sweep)):
         if table is not None:
             write_csv(table, scratch / name)
+
+
+def relocate_experiment(experiment: Experiment, logs: Sequence[KnownLog], folder: Path) -> dict[str, Any]:
+    """An experiment of these logs as plain data, with paths as they are from a folder."""
+    data = experiment.as_written()
+    data["logs"] = log_entries(experiment.logs, logs, folder)
+    for latency in _find_recorded_latencies(data):
+        latency["file"] = relative_path(latency["file"], folder)
+    for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
+        site["file"] = relative_path(site["file"], folder)
+    return data
 
 
 def _write_provenance(folder: Path, said: Mapping[str, object], files: Iterable[str]) -> None:
