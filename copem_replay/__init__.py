@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from copem_replay.extras.film.film import write_film
     from copem_replay.extras.fitting.api import FittedPem, fit
     from copem_replay.extras.history.history import write_history
+    from copem_replay.extras.require.api import Requirement, require
+    from copem_replay.extras.require.outputs import write_requirement
     from copem_replay.extras.why.api import Explanation, why
     from copem_replay.fusion.interface import Inbox, ListFusion, StepFusion
     from copem_replay.fusion.testing import FUSION_RULES, NonconformingError, check_fusion
@@ -100,6 +102,7 @@ __all__ = [
     "ReceptionModel",
     "Recording",
     "RecordingError",
+    "Requirement",
     "Results",
     "RowMetric",
     "Scene",
@@ -129,6 +132,7 @@ __all__ = [
     "read_lists",
     "read_recording",
     "read_recordings",
+    "require",
     "run",
     "view",
     "why",
@@ -136,6 +140,7 @@ __all__ = [
     "write_film",
     "write_history",
     "write_report",
+    "write_requirement",
 ]
 
 _PLACES = {

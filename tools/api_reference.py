@@ -34,6 +34,7 @@ GROUPS = {
     "Runs": "run observations fused_tracks FusedTracks read_lists why Explanation",
     "Fits": "fit FittedPem",
     "Results": "load_results Results compare Comparison judge Judgement write_report write_history view",
+    "Requirements": "require Requirement write_requirement",
     "Figures": "plot write_figures write_film",
     "Keys of an experiment": "Experiment Unit Configuration Measure Onset",
     "Data": "Recording Scene Tracks ObjectLists Inputs Inbox entries_of ViewGeometry Errors CLASSES",

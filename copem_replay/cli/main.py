@@ -1,7 +1,7 @@
 """The command line `copem-replay`: its commands, and the one place where errors become exit codes.
 
-0 done · 1 done, but a log was skipped, a replay or page could not be written, or a fitted model fails its replay check
-· 2 wrong input: plain lines on stderr · 70 internal error: traceback · 130 interrupted.
+0 done · 1 done, but a log was skipped, a replay or page could not be written, a criterion does not pass, or a fitted
+model fails its replay check · 2 wrong input: plain lines on stderr · 70 internal error: traceback · 130 interrupted.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def version(
 GROUPS = {
     "From a recording to an experiment": (inspect.info, inspect.init, inspect.check, inspect.schema, inspect.samples),
     "Replay": (run.run, "why", "fit"),
-    "Judge": (results.compare, results.verdict, "history"),
+    "Judge": (results.compare, results.verdict, "require", "history"),
     "Look": (results.view, results.report, results.plot, "film", "layout", "export"),
 }
 """Commands by what they are for: functions of the core, names of extras. Extras of no group are of the first."""

@@ -13,6 +13,7 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
     "command": {
         "why": "why.command:why",
         "fit": "fitting.command:fit",
+        "require": "require.command:require",
         "history": "history.command:history",
         "film": "film.command:film",
         "layout": "layout.command:layout",
@@ -24,6 +25,9 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
         "why": "why.api:why",
         "FittedPem": "fitting.api:FittedPem",
         "fit": "fitting.api:fit",
+        "Requirement": "require.api:Requirement",
+        "require": "require.api:require",
+        "write_requirement": "require.outputs:write_requirement",
         "write_film": "film.film:write_film",
         "write_history": "history.history:write_history",
     },

@@ -234,13 +234,7 @@ def _list_row_files(study: StudyTables) -> list[str]:
 
 def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]] = ()) -> None:
     """Write the experiment and all tables, with paths as they are from a folder."""
-    experiment = study.experiment
-    data = resolve_sweep(experiment).as_written()
-    data["logs"] = log_entries(experiment.logs, study.recordings, folder)
-    for latency in _find_recorded_latencies(data):
-        latency["file"] = relative_path(latency["file"], folder)
-    for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
-        site["file"] = relative_path(site["file"], folder)
+    data = relocate_experiment(resolve_sweep(study.experiment), study.recordings, folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
     write_csv(study.summary, scratch / "summary.csv")
@@ -253,7 +247,22 @@ def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Seque
             write_csv(table, scratch / name)
 
 
+<<<<<<< HEAD
 def _write_provenance(folder: Path, content: Mapping[str, object], files: Iterable[str]) -> None:
+=======
+def relocate_experiment(experiment: Experiment, logs: Sequence[KnownLog], folder: Path) -> dict[str, Any]:
+    """An experiment of these logs as plain data, with paths as they are from a folder."""
+    data = experiment.as_written()
+    data["logs"] = log_entries(experiment.logs, logs, folder)
+    for latency in _find_recorded_latencies(data):
+        latency["file"] = relative_path(latency["file"], folder)
+    for site in (one for entry in (data, *data["logs"]) if isinstance(entry, dict) for one in entry.get("maps") or ()):
+        site["file"] = relative_path(site["file"], folder)
+    return data
+
+
+def _write_provenance(folder: Path, said: Mapping[str, object], files: Iterable[str]) -> None:
+>>>>>>> 5edf963791d9fb6be6fd7fdfa64d0b84a3daf6a4
     """Write `provenance.json` of a folder that is complete but for it, with the seals of its files."""
     text = json.dumps(seal_results(folder, files, content), indent=1, ensure_ascii=False)
     (folder / MARK).write_text(f"{text}\n", encoding="utf-8")

@@ -41,7 +41,7 @@ configurations:
   a fusion of two units, with a long name: {units: all, latency_s: 1.0, fusion: {kind: gnn}}
 """
 COMMANDS = ("", "info", "init", "check", "schema", "samples", "convert", "run", "why", "fit", "compare", "verdict",
-            "history", "view", "report", "plot", "film", "layout", "export")  # fmt: skip
+            "require", "history", "view", "report", "plot", "film", "layout", "export")  # fmt: skip
 FORMATS = ("argoverse2", "nuscenes", "opv2v", "v2xseq", "openlabel", "commonroad", "sumo", "csv")
 
 

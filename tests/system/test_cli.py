@@ -1343,7 +1343,7 @@ class TestView:
 
 class TestSamples:
     def test_runs_elsewhere(self, tmp_path: Path, call: Call) -> None:
-        assert call("samples") == (0, "14 files in logs\nnext: copem-replay run logs/tc016d.yaml\n", [])
+        assert call("samples") == (0, "15 files in logs\nnext: copem-replay run logs/tc016d.yaml\n", [])
         for path in (ROOT / "logs").iterdir():
             assert (tmp_path / "logs" / path.name).read_bytes() == path.read_bytes()
         assert call("check", "logs/tc016d.yaml").code == 0

@@ -54,6 +54,7 @@ def test_the_readme_begins_with_what_it_is_and_how_it_looks() -> None:
         ("README.md", [], ["copem-replay run"]),
         ("docs/tutorial.md", ["copem-replay run"], ["python tools/paper.py"]),
         ("docs/guide/links.md", ["copem-replay run"], ["python tools/links_table.py"]),
+        ("docs/guide/require.md", [], ["copem-replay require"] * 2),
         (
             "docs/guide/which-fusion.md",
             ["copem-replay run"] * 2,
@@ -82,7 +83,13 @@ def test_the_own_reception_of_the_links_page_keeps_the_rules() -> None:
 
 def test_all_outputs_on_pages_are_tested() -> None:
     marked = [page for page in PAGES if "<!-- output: " in page.read_text(encoding="utf-8")]
-    assert sorted(page.name for page in marked) == ["README.md", "links.md", "tutorial.md", "which-fusion.md"]
+    assert sorted(page.name for page in marked) == [
+        "README.md",
+        "links.md",
+        "require.md",
+        "tutorial.md",
+        "which-fusion.md",
+    ]
 
 
 @on_x86

@@ -83,6 +83,7 @@ def arguments_of(words: list[str], command: Callable[..., Any]) -> list[str]:
     for name, (info, _) in guard._list_parameters(command).items():
         if isinstance(info, ArgumentInfo):
             told += ["e.yaml" if name == "experiment" else "out/e"]
+    told += ["--criterion", "known", "--free", "seed"] * (words == ["require"])
     return told + ["--unit", "ego"] * (words == ["fit"]) + ["--overwrite"] * (words[0] == "convert")
 
 
@@ -90,7 +91,7 @@ def arguments_of(words: list[str], command: Callable[..., Any]) -> list[str]:
 def test_there_are_the_options_that_are_known_to_be_there() -> None:
     flags = {name for _, command in list_commands() for name in guard.list_outputs(command)}
     assert flags == {"out", "junit", "markdown", "jsonl", "rrd", "pieces"}
-    assert len(OUTPUTS) == 23
+    assert len(OUTPUTS) == 25
 
 
 @pytest.mark.parametrize(("words", "command", "name"), OUTPUTS)
@@ -179,6 +180,7 @@ def test_a_command_replaces_its_own_earlier_output(here: Path, call: Call) -> No
         ["layout", "out/e", "--out", "layout.json"],
         ["history", "out/e"],
         ["why", "out/e", "--causes"],
+        ["require", "e.yaml", "--criterion", "known", "--free", "configurations.coPEM.latency_s=0:1:0.5"],
         ["convert", "csv", "t.csv", "--out", "t.mcap", "--overwrite"],
     ]
     for command in commands:
