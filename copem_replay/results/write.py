@@ -247,9 +247,6 @@ def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Seque
             write_csv(table, scratch / name)
 
 
-<<<<<<< HEAD
-def _write_provenance(folder: Path, content: Mapping[str, object], files: Iterable[str]) -> None:
-=======
 def relocate_experiment(experiment: Experiment, logs: Sequence[KnownLog], folder: Path) -> dict[str, Any]:
     """An experiment of these logs as plain data, with paths as they are from a folder."""
     data = experiment.as_written()
@@ -261,8 +258,7 @@ def relocate_experiment(experiment: Experiment, logs: Sequence[KnownLog], folder
     return data
 
 
-def _write_provenance(folder: Path, said: Mapping[str, object], files: Iterable[str]) -> None:
->>>>>>> 5edf963791d9fb6be6fd7fdfa64d0b84a3daf6a4
+def _write_provenance(folder: Path, content: Mapping[str, object], files: Iterable[str]) -> None:
     """Write `provenance.json` of a folder that is complete but for it, with the seals of its files."""
     text = json.dumps(seal_results(folder, files, content), indent=1, ensure_ascii=False)
     (folder / MARK).write_text(f"{text}\n", encoding="utf-8")
