@@ -7,7 +7,7 @@ the Python function.
 
 At each call Numba counts, atomically, references to each array that is handed over. For a function called for each
 entry this takes several times as long as its work. `borrowing` and `making` say whether references are counted;
-functions that are called inherit it: docs/develop/decisions/0039-counted-references.md.
+functions that are called inherit it: docs/develop/decisions/speed.md.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def call_in_room(
 
     Python has frames in pieces of 16 KiB, and gives a piece back as soon as the first frame in it ends. Where calls go
     to and fro over the end of a piece, which compiling does half a million times, each asks the system for memory.
-    Each thread has its own pieces: docs/develop/decisions/0062-compiling-asks-less.md.
+    Each thread has its own pieces: docs/develop/decisions/speed.md.
     """
     return function(*arguments, **named)
 
