@@ -14,7 +14,7 @@ four configurations and a baseline that are all alike, eight metrics, one of the
 (Holm), and of one metric that is named before.
 
 Gates: coverage of at least .93, at most .04 wrongly met, .06 of tables starred, with two standard errors. A *line* is a
-row of the table in docs/reference/intervals.md; one that is beyond a gate is named there, in bold, else the exit code is 1.
+row of the table in docs/reference/intervals.md; one beyond a gate is named there, in bold, else the exit code is 1.
 """
 
 from __future__ import annotations

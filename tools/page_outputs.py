@@ -2,8 +2,8 @@
 
 A block after `<!-- output: COMMAND -->` is replaced by what the command prints, in the order of the page; with
 `COMMAND | head N` by its first N lines. Blocks after `<!-- file: out/NAME -->` are written to that file first, then
-commands in `<!-- before: COMMAND -->` are run. Files go into a scratch folder in place of `out/`. The tests of the pages
-fail where a block differs; this writes it anew, and the difference is for a reader: `git diff`.
+commands in `<!-- before: COMMAND -->` are run. Files go into a scratch folder in place of `out/`. The tests of the
+pages fail where a block differs; this writes it anew, and the difference is for a reader: `git diff`.
 """
 
 from __future__ import annotations
