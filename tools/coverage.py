@@ -14,7 +14,7 @@ four configurations and a baseline that are all alike, eight metrics, one of the
 (Holm), and of one metric that is named before.
 
 Gates: coverage of at least .93, at most .04 wrongly met, .06 of tables starred, with two standard errors. A *line* is a
-row of the table in docs/guide/metrics.md; one that is beyond a gate is named there, in bold, else the exit code is 1.
+row of the table in docs/reference/intervals.md; one beyond a gate is named there, in bold, else the exit code is 1.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ HORIZON_S: Final = 5.0
 CLUSTERS: Final = (3, 4, 5, 8, 13, 20, 60)
 COVERAGE, WRONG, STARRED = 0.93, 0.04, 0.06
 """The gates: the least coverage, the most that is wrongly met, the most tables with a false `*`."""
-GUIDE: Final = Path(__file__).parents[1] / "docs" / "guide" / "metrics.md"
+GUIDE: Final = Path(__file__).parents[1] / "docs" / "reference" / "intervals.md"
 _ROUNDING: Final = 1e-9
 Generator = np.random.Generator
 Draw = Callable[[Float], Float]
@@ -632,7 +632,7 @@ def coverage(studies: int, seed: int) -> pd.DataFrame:
 
 
 def sum_up(table: pd.DataFrame) -> list[str]:
-    """The lines of the guide's table: of each number of clusters the least coverage, and the median of the widths."""
+    """The lines of the page's table: of each number of clusters the least coverage, and the median of the widths."""
     kinds = list(dict.fromkeys(table["line"].str.partition(",")[0]))
     lines = sorted(table["line"].unique(), key=lambda line: kinds.index(line.partition(",")[0]))
     clusters = [str(K) for K in CLUSTERS]

@@ -54,7 +54,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for target in sorted(linked_files(sources)):
         files.append(File.generated(config, place_of(target), abs_src_path=str(ROOT / target)))
     for file in files:
-        if file.src_uri.startswith(f"{DECISIONS}/0"):
+        if file.src_uri.startswith(f"{DECISIONS}/") and not file.src_uri.endswith("/index.md"):
             file.inclusion = InclusionLevel.NOT_IN_NAV  # one by one they are in the list of decisions
     return files
 
@@ -144,8 +144,8 @@ def linked_files(sources: list[tuple[str, str]]) -> set[str]:
 
 def list_decisions(docs: Path) -> str:
     """A page that lists the decisions by their titles."""
-    lines = ["# Decisions", "", "What was decided, and why. There are none with the numbers 33 to 35.", ""]
-    for path in sorted((docs / DECISIONS).glob("0*.md")):
+    lines = ["# Decisions", "", "What is decided, and why, room by room.", ""]
+    for path in sorted((docs / DECISIONS).glob("*.md")):
         lines.append(f"- [{path.read_text('utf-8').splitlines()[0].lstrip('# ')}]({path.name})")
     return "\n".join([*lines, ""])
 

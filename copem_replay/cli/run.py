@@ -148,7 +148,8 @@ def _read_source(paths: Sequence[Path]) -> ExperimentSource:
     text, surveys = draft_drives(paths)
     if text is None:
         raise InputError(explain_undrafted(surveys))
-    return read_experiment_text(Path(f"draft of {', '.join(map(str, paths))}"), text)
+    named = ", ".join(path.name for path in paths)  # without a folder: the draft names recordings from the working one
+    return read_experiment_text(Path(f"draft of {named}"), text)
 
 
 def _judge_results(results: Results) -> Judgement | None:

@@ -7,7 +7,7 @@ the Python function.
 
 At each call Numba counts, atomically, references to each array that is handed over. For a function called for each
 entry this takes several times as long as its work. `borrowing` and `making` say whether references are counted;
-functions that are called inherit it: docs/develop/decisions/0039-counted-references.md.
+functions that are called inherit it: docs/develop/decisions/speed.md.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def call_in_room(
 
     Python allocates frames in chunks of 16 KiB and frees a chunk as soon as its first frame ends. Calls that go back
     and forth over a chunk's end, half a million times while compiling, would each ask the system for memory. Chunks are
-    per thread: docs/develop/decisions/0062-compiling-asks-less.md
+    per thread: docs/develop/decisions/speed.md
     """
     return function(*arguments, **named)
 

@@ -4,7 +4,7 @@ What is read again of them is JSON, and may be damaged or a stranger's: `parse_j
 
 A file is written as `.NAME.xxxxxxxx.tmp`, a folder as `new` in a folder of that name, with a list of what may be
 removed; both are locked as long as their process lives. When it is killed they stay, their lock free, and
-`remove_leftovers` removes them: docs/develop/decisions/0080-one-gate-for-outputs.md.
+`remove_leftovers` removes them: docs/develop/decisions/results.md.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ given time.
 Sources: a Poisson process restarts at any instant without a change of its law (memoryless), so cells of time have their
 renewals each by itself. The path is made by bridges in a binary tree, as Brownian paths are in Li, Wong, Chen and
 Duvenaud, "Scalable gradients for stochastic differential equations", AISTATS 2020; the bridge is that of any
-Gauss–Markov process. docs/develop/decisions/0023-errors-that-last.md.
+Gauss–Markov process. docs/develop/decisions/random-numbers.md.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class Tracker(ListFusion):
 
     kind: Literal["tracker"] = "tracker"
     late: Literal["stale", "predict", "replay"] = "predict"
-    # The defaults are round numbers; for `gate` and `forget_s` see docs/develop/decisions/0015-fusions.md.
+    # The defaults are round numbers; for `gate` and `forget_s` see docs/develop/decisions/fusion.md.
     acceleration_psd_m2ps3: Positive = 1.0
     speed_sigma_mps: Positive = 3.0
     gate: Annotated[float, Field(strict=True, gt=0, lt=1)] = 0.999

@@ -322,7 +322,7 @@ ENTRIES_PER_LIST = 65536
 """Track ids: number of the founding list × this + place of the founding entry in it."""
 SAME_OBJECT = 1.386
 """d² up to which two tracks can be of one object: the median of χ² with 2 degrees of freedom, so half of the pairs of
-entries of one object are closer. docs/develop/decisions/0015-fusions.md."""
+entries of one object are closer. docs/develop/decisions/fusion.md."""
 _NOTHING_NEW = 1e12
 """An entry that counts as one of so many times its variance changes no state: it is left out."""
 _LEAST_COST = 1e-6

@@ -339,10 +339,10 @@ SETUP = ("n", "list_rate_hz", "n_conflict", "driving_h", "must_brake_s")
 def describe_mean(horizon_s: float, *, censored: bool) -> str:
     """The words for a restricted mean. `censored`: whether rows are still undetected when the ego or the log ends."""
     up_to = f"{format_cell(horizon_s)} s"
-    words = f"mean of min(time to detection, {up_to}), never detected counting as {up_to}"
+    words = f"mean of min(time until known, {up_to}), never known counting as {up_to}"
     if not censored:
         return words
-    return f"{words}; an object still undetected when the log or the ego ends counts as those that are followed longer"
+    return f"{words}; an object still unknown when the log or the ego ends counts as those that are followed longer"
 
 
 def has_undetected(summary: pd.DataFrame) -> bool:

@@ -313,7 +313,7 @@ def _limit_metrics(
     )  # fmt: skip
 
 
-_MEAN = "mean of min(time to detection, horizon), never detected counting as the horizon"
+_MEAN = "mean of min(time after which it is known, horizon), never detected counting as the horizon"
 
 _DETECTION_METRICS = (
     Metric("n", attrgetter("rows"), lambda rows: int(rows["runs"].sum()), 0,
@@ -325,26 +325,25 @@ _DETECTION_METRICS = (
            Compared("share detected", itemgetter("detected"))),
     *_limit_metrics("detected_share", estimate_detected_share),
     Metric("ttd_p5_s", summarise_detections, lambda of: of.quantile_s(0.05), -1,
-           "time to detection by which 5 % of the rows were detected"),
+           "time after which 5 % of the rows are known"),
     Metric("ttd_median_s", summarise_detections, lambda of: of.quantile_s(0.5), -1,
-           "median time to detection", "summary", "median time to detection, s"),
+           "median of the time after which an object is known", "summary", "known after (median), s"),
     Metric("ttd_p95_s", summarise_detections, lambda of: of.quantile_s(0.95), -1,
-           "time to detection by which 95 % were detected; a dash: fewer were ever detected", "summary",
-           "95 % detected by, s"),
+           "time after which 95 % are known; a dash: fewer ever are", "summary", "known after (95 % by), s"),
     Metric("ttd_rmst_s", summarise_detections, lambda of: of.mean_s(), -1, _MEAN, "summary",
-           "mean time to detection, s", Compared(_MEAN, "restricted means")),
-    compared_metric("ttd_both_s", -1, "summary", "mean time where both detect, s",
-                    Compared("mean time to detection over the rows that both detect; beside it those that one alone "
-                             "detects", "means where both detect")),
+           "known after (mean), s", Compared(_MEAN, "restricted means")),
+    compared_metric("ttd_both_s", -1, "summary", "known after where both detect, s",
+                    Compared("mean time after which it is known over the rows that both detect; beside it those that "
+                             "one alone detects", "means where both detect")),
     Metric("ttd_rmst_horizon_s", summarise_detections, lambda of: of.horizon_s, 0, "the horizon of ttd_rmst_s"),
     Metric("ttd_rmst_s_low", limit_means, _end_of_mean(0, "low"), 0, "lower limit of ttd_rmst_s, 95 %"),
     Metric("ttd_rmst_s_high", limit_means, _end_of_mean(0, "high"), 0, "upper limit of ttd_rmst_s, 95 %"),
     Metric("unknown_s", measure_unknown, lambda of: of.mean_s, -1,
-           "mean seconds from the onset to the detection or the end of the episode; needs no horizon", "summary",
-           "mean time unknown, s"),
+           "mean seconds from the onset until it is known or gone; needs no horizon", "summary",
+           "unknown (mean), s"),
     Metric("unknown_to_horizon_s", measure_unknown, lambda of: of.to_horizon_s, -1,
-           "mean of min(time unknown, horizon): what criteria and stars judge, for one long episode decides no mean",
-           "summary", "mean time unknown up to the horizon, s",
+           "mean of min(seconds unknown, horizon): what criteria and stars judge, for one long stay decides no mean",
+           "summary", "unknown up to the horizon (mean), s",
            Compared("mean of min(seconds unknown, horizon)", "times unknown")),
     Metric("unknown_to_horizon_s_low", limit_means, _end_of_mean(1, "low"), 0,
            "lower limit of unknown_to_horizon_s, 95 %"),
@@ -355,15 +354,15 @@ _DETECTION_METRICS = (
     Metric("open_share", measure_unknown, lambda of: of.open_share, 0,
            "share of the rows still undetected when the log or the ego ended: censored", "undetected",
            "undetected at the end, %"),
-    compared_metric("ttd_rmst_s_equal_ghosts", -1, "summary", "mean time at equal false positives, s",
+    compared_metric("ttd_rmst_s_equal_ghosts", -1, "summary", "known after at equal false positives, s",
                     Compared("the same at as many false positives per minute as the baseline has",
                              "restricted means at equal ghosts", ("lists.parquet", "thresholds.parquet"))),
     Metric("dad_median_m", summarise_detections, lambda of: of.distance_quantile_m(0.5), 1,
            "median distance at detection, centre to centre; never detected ranks below all", "summary",
-           "median distance at detection, m",
+           "at distance (median), m",
            Compared("median of the differences of distances at detection", "distances")),
     Metric("dad_p5_m", summarise_detections, lambda of: of.distance_quantile_m(0.05), 1,
-           "distance at detection that 95 % of the rows exceed", "summary", "95 % detected beyond, m"),
+           "distance at detection that 95 % of the rows exceed", "summary", "at distance (95 % beyond), m"),
 )  # fmt: skip
 
 _CONFLICT_METRICS = (

@@ -6,7 +6,7 @@
 They are in a folder or under a URL. Two processes that write the same part write the same bytes. The recipe is all that
 a part is made of, as canonical JSON: the log's resolved experiment without what cannot change a row, NOT_OF_A_PART.
 That is right as draws have addresses, and as adding a unit, a configuration or an object changes no other draw
-(docs/develop/decisions/0047-parts.md).
+(docs/develop/decisions/scale.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The place of a results folder during a run: checked, locked, tidied up, and in the end replaced by the new one.
 
 A folder lists the files of its results in `provenance.json`, and those that commands made of them in `made.jsonl`; both
-go when new results take its place, the user's own files stay. See docs/develop/decisions/0080-one-gate-for-outputs.md.
+go when new results take its place, the user's own files stay. See docs/develop/decisions/results.md.
 """
 
 from __future__ import annotations

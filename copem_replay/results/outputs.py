@@ -1,7 +1,7 @@
 """The gate of every output: whether a command may write a path, and how it writes what it makes of results.
 
 No recording, experiment or map, no file of a results folder and no input of the command is ever replaced, by whatever
-name it is given. See docs/develop/decisions/0080-one-gate-for-outputs.md.
+name it is given. See docs/develop/decisions/results.md.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from copem_replay.core.errors import InputError, count_noun, escape_unprintable
 from copem_replay.core.files import parse_json
 from copem_replay.metrics.limits import format_limits
 from copem_replay.metrics.summary import format_cell, format_table
+from copem_replay.metrics.summary_metrics import COMPARED, METRIC
 from copem_replay.results.compare.tables import escape_markdown
 from copem_replay.results.outputs import check_output, check_outputs, made_file
 from copem_replay.results.table_files import AGAIN
@@ -77,9 +78,11 @@ class Verdict:
 
     @property
     def asked(self) -> str:
-        """The bound in words: `ttd_p95_s ≤ 0.5`, `ttd_rmst_s − that of PEM ≤ 0.05`."""
+        """The bound: `known after (95 % by) ≤ 0.5 s`, `known after (mean) − that of PEM ≤ 0.05 s`."""
+        metric = (METRIC | COMPARED).get(self.metric)
+        words, _, unit = metric.header.partition(", ") if metric and metric.header else (self.metric, "", "")
         less = f" − that of {self.against}" if self.against else ""
-        return f"{self.metric}{less} {SIGNS[self.direction]} {format_cell(self.bound)}"
+        return f"{words}{less} {SIGNS[self.direction]} {format_cell(self.bound)} {unit.removesuffix('%')}".rstrip()
 
     @property
     def found(self) -> str:
@@ -196,13 +199,8 @@ def verdicts_junit(verdicts: Judgement) -> str:
     """
     tags = {id(verdict): _junit_tag(verdict) for verdict in verdicts.all}
     counts = Counter(tags.values())
-    numbers = {
-        "tests": str(len(verdicts.all)),
-        "failures": str(counts["failure"]),
-        "errors": str(counts["error"]),
-        "skipped": str(counts["skipped"]),
-        "time": "0",
-    }
+    numbers = {"tests": str(len(verdicts.all)), "failures": str(counts["failure"]), "errors": str(counts["error"]),
+               "skipped": str(counts["skipped"]), "time": "0"}  # fmt: skip
     root = ElementTree.Element("testsuites", {"name": "copem-replay", **numbers})
     suite = ElementTree.SubElement(root, "testsuite", {"name": escape_unprintable(verdicts.place), **numbers})
     for verdict in verdicts.all:

@@ -1,7 +1,7 @@
 """Numbers that last, computed plainly: whole integers, one number at a time, nothing kept.
 
 Philox from its paper; renewals and the path straight from their definitions
-(docs/develop/decisions/0023-errors-that-last.md).
+(docs/develop/decisions/random-numbers.md).
 """
 
 from __future__ import annotations

@@ -305,7 +305,7 @@ def test_an_autoregression_fits_what_drifts() -> None:
 
 
 def test_by_which_part_a_list_goes_and_where_its_numbers_are() -> None:
-    """By the plain oracle: the choice among cumulative shares, and the address of each number; decisions 1 and 23."""
+    """By the plain oracle: the choice among cumulative shares, and the address of each number."""
     log = two_standing(1.0)
     parts = [
         {"share": 0.3, "correlation_s": 0.5}, {"share": 0.2, "correlation_s": 0.5, "of": "unit"},

@@ -335,7 +335,7 @@ def test_headers_have_units_also_of_own_metrics() -> None:
         "cost": "cost",
     }
     assert {name: column_header(name) for name in own} == own
-    assert strip_unit("ttd_rmst_s") == "mean time to detection"
+    assert strip_unit("ttd_rmst_s") == "known after (mean)"
     assert difference_column_header("pass_share") == "passes, percentage points"
     assert (format_value("late_share", 0.5), format_value("cost", math.nan)) == ("50.0", "–")
     assert [format_value("cost", value) for value in (0.2, -0.0, 4.87e-5, -4.87e-5, 12.345, 4321.5)] == [

@@ -167,14 +167,14 @@ class TestNumbers:
 
     def test_times_come_first_and_headers_have_units(self, read: Page) -> None:
         assert read.rows["summary"][0] == [
-            "configuration", "mean time to detection, s", "median time to detection, s", "95 % detected by, s",
-            "detected, %", "mean time unknown, s", "mean time unknown up to the horizon, s",
-            "median distance at detection, m", "95 % detected beyond, m",
+            "configuration", "known after (mean), s", "known after (median), s", "known after (95 % by), s",
+            "detected, %", "unknown (mean), s", "unknown up to the horizon (mean), s",
+            "at distance (median), m", "at distance (95 % beyond), m",
         ]  # fmt: skip
-        assert read.rows["regret"][0][1:3] == ["mean time to detection, s", "detected, percentage points"]
+        assert read.rows["regret"][0][1:3] == ["known after (mean), s", "detected, percentage points"]
         assert read.rows["regret-lists"][0][1:] == [
-            "error of what is held (RMSE), m",
-            "GOSPA of what is held, m",
+            "position error of the newest list (RMSE), m",
+            "GOSPA of the newest list, m",
             "false positives per minute",
         ]
 

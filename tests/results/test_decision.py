@@ -375,12 +375,12 @@ def test_criteria_are_the_sentence() -> None:
     assert said(MET) == "Good enough: the one verdict passes."
     assert said(MET, MET) == "Good enough: all 2 verdicts pass."
     assert said(MET, UNDECIDED) == (
-        "Not shown to be good enough: 1 of 2 verdicts does not pass: v1 with PEM is undecided (asked: ttd_rmst_s ≤ "
-        "0.5, found: 0.7)."
+        "Not shown to be good enough: 1 of 2 verdicts does not pass: v1 with PEM is undecided (asked: known after "
+        "(mean) ≤ 0.5 s, found: 0.7)."
     )
     assert said(UNDECIDED, NOT_MET, MET) == (
-        "Not good enough: 2 of 3 verdicts do not pass: v1 with PEM is not met (asked: ttd_rmst_s ≤ 0.5, found: 0.7), "
-        "and 1 more."
+        "Not good enough: 2 of 3 verdicts do not pass: v1 with PEM is not met (asked: known after (mean) ≤ 0.5 s, "
+        "found: 0.7), and 1 more."
     )
 
 

@@ -232,13 +232,13 @@ def test_the_table_has_signs_and_intervals(tmp_path):
 def test_what_the_table_shows_is_said_below(tmp_path):
     lines = comparison_text(six_objects(tmp_path)).splitlines()[4:]
     assert lines == [
-        "differences to ideal, paired by log, object and run; accuracy is of the newest list at each frame",
+        "differences to ideal, paired by log, object and run; accuracy of the newest list at each frame",
         "baseline ideal: by its name; --baseline names another",
         "[95 %]: over 6 objects of this drive: how far other objects of this drive may differ; nothing about other "
         "drives",
         "detected_share: exact binomial limits where the difference is the same in every cluster",
         "(all alike): no interval, the difference is the same in every cluster (of a median in nearly all)",
-        "ttd_rmst_s: mean of min(time to detection, 10 s), never detected counting as 10 s; an object still undetected "
+        "ttd_rmst_s: mean of min(time until known, 10 s), never known counting as 10 s; an object still unknown "
         "when the log or the ego ends counts as those that are followed longer",
     ]
 
@@ -248,7 +248,7 @@ def test_who_is_better_beyond_the_interval_is_said(tmp_path):
     rows += [row("fast", 0.75 - k / 100, 32.5 + k, object_id=str(k)) for k in range(6)]
     lines = comparison_text(compare_folders([write_folder(tmp_path / "study", rows)])).splitlines()
     assert lines[-1] == "better than ideal in ttd_rmst_s, ttd_both_s, unknown_to_horizon_s (*): fast"
-    assert "*: the interval excludes 0, the 5 differences of this table together held at 95 %" in lines
+    assert "*: the interval excludes 0, the 5 differences of this table together at 95 %" in lines
     # At 1 − .05/5 six objects have no limit of a median.
     assert "°: its own interval alone excludes 0; of 5 such 1 in 20 does by chance" in lines
 
@@ -331,9 +331,9 @@ def test_without_an_interval_nothing_is_claimed(tmp_path):
 def test_markdown_has_the_same_content(tmp_path):
     comparison = six_objects(tmp_path)
     text, markdown = comparison_text(comparison).splitlines(), comparison_markdown(comparison).splitlines()
-    assert (
-        markdown[0]
-        == "| configuration | detected_share | ttd_rmst_s | ttd_both_s | unknown_to_horizon_s | dad_median_m |"
+    assert markdown[0] == (
+        "| configuration | detected | known after (mean) | known after where both detect | "
+        "unknown up to the horizon (mean) | at distance (median) |"
     )
     assert markdown[1] == "| --- | --- | --- | --- | --- | --- |"
     cells = [line.replace("\\|", "\0").strip("| ").split(" | ") for line in markdown[2:5]]
@@ -342,7 +342,14 @@ def test_markdown_has_the_same_content(tmp_path):
         assert line.split() == " ".join(of_row).replace("\0", "|").split()
     notes = [f"note: {note}" for note in comparison.notes]
     assert len(notes) == 1
-    assert [line.removeprefix("- ") for line in markdown[6:]] == [*text[4:], *notes]
+    said = "\n".join([*text[4:], *notes])
+    for name, header in {
+        "detected_share": "detected", "ttd_rmst_s_equal_ghosts": "known after at equal false positives",
+        "ttd_rmst_s": "known after (mean)", "position_rmse_held_m": "position error of the newest list (RMSE)",
+        "gospa_held_m": "GOSPA of the newest list", "false_positives_per_min": "false positives per minute",
+    }.items():  # fmt: skip
+        said = said.replace(name, header)
+    assert [line.removeprefix("- ") for line in markdown[6:]] == said.splitlines()
 
 
 class Cells(HTMLParser):

@@ -421,6 +421,12 @@ class TestCheck:
             assert (here / "out/drive" / file).read_bytes() == (here / "out/draft" / file).read_bytes()
         assert call("check", "out/drive/experiment.yaml").code == 0
 
+    def test_run_takes_a_recording_in_a_folder(self, here: Path, call: Call) -> None:
+        (here / "drives").mkdir()
+        shutil.copy(here / "drive.mcap", here / "drives/monday.mcap")
+        assert call("run", "drives/monday.mcap", "--runs", "1").code == 0
+        assert (here / "out/monday/summary.csv").is_file()
+
     def test_run_of_several_recordings_is_one_study(self, here: Path, call: Call) -> None:
         shutil.copy(here / "drive.mcap", here / "second.mcap")
         assert call("run", "drive.mcap", "second.mcap", "--runs", "2").code == 0

@@ -146,7 +146,7 @@ def test_no_row_of_a_short_table_is_beyond_a_gate(tool: ModuleType, monkeypatch:
     busy = table[(table["line"] == "times, bad logs that are busy") & (table["clusters"] == 8)]
     assert (busy["held"] / busy["of"]).min() < 0.95
     assert (busy["named"] == "times, bad logs that are busy").all()
-    # The guide has all lines, and no other: a name that is misspelt there would name nothing.
+    # The page has all lines, and no other: a name that is misspelt there would name nothing.
     guide = tool.GUIDE.read_text(encoding="utf-8").splitlines()
     assert {line.split("|")[1].strip(" *") for line in guide if " · " in line and line[0] == "|"} == {
         "held · width",

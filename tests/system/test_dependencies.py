@@ -53,9 +53,9 @@ def test_every_extra_is_pinned_and_what_is_compiled_has_files_for_many_platforms
     assert all(len(pins[name][1]) > 20 for name in ("numpy", "pandas", "pyarrow", "scipy", "shapely"))
 
 
-def test_decision_6_says_of_every_package_what_it_is_for() -> None:
+def test_the_page_of_dependencies_says_of_every_package_what_it_is_for() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    page = (ROOT / "docs/develop/decisions/0006-dependencies.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/develop/decisions/dependencies.md").read_text(encoding="utf-8")
     rows = [line.split("|")[1:-1] for line in page.splitlines() if re.match(r"\| [\w`]", line)][1:]
     assert all(len(row) == 5 and all(cell.strip() for cell in row) for row in rows)
     runs = " ".join(row[0] for row in rows)

@@ -2,7 +2,7 @@
 
 The command then finds every part among those that are kept, as it does when it is run again: results are the same
 bytes, whichever worker computes and in whatever order. A task is a log with all its missing parts. Text and paths are
-sent, a receipt comes back; rows, recordings and modules are never sent (docs/develop/decisions/0036-crew.md).
+sent, a receipt comes back; rows, recordings and modules are never sent (docs/develop/decisions/scale.md).
 """
 
 from __future__ import annotations

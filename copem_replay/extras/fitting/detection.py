@@ -44,7 +44,7 @@ from copem_replay.perception.pem.detection import TableDetection
 
 LEVELS = 50
 """Probabilities are distinguished by steps of π/2 over this in the arcsine of their root: less than 3e-4 nats per list
-are lost (docs/develop/decisions/0030-fitted-detection.md)."""
+are lost (docs/develop/decisions/fitting.md)."""
 _SHARES = (0.01, 0.999)
 """Bounds of the share that lasts: log-odds have none at 0 and 1."""
 

@@ -96,7 +96,7 @@ def maximise_likelihood(
     """Where a log-likelihood of a few numbers is largest, and its maximum: the best of Newton's method from each start.
 
     With derivatives by differences, along the eigenvectors of the curvature, damped where a step gains nothing: for so
-    few numbers fewer calls than L-BFGS (docs/develop/decisions/0032-fitted-errors.md).
+    few numbers fewer calls than L-BFGS (docs/develop/decisions/fitting.md).
     """
     low, high = np.array(bounds, dtype=float).reshape(-1, 2).T
     maxima = [_climb(logp, np.clip(np.asarray(start, dtype=float), low, high), low, high) for start in starts]
@@ -188,7 +188,7 @@ def profile_limits(logp: LogLikelihood, best: Float, value: float, k: int, bound
 FEWEST_PASSES = 4
 """Passes below which none is held out: a standard error of fewer differences says little."""
 PASSES_ALONE = 5
-"""Passes from which on an interval is by passes alone (docs/develop/decisions/0044-how-sure-a-fit-is.md)."""
+"""Passes from which on an interval is by passes alone (docs/develop/decisions/fitting.md)."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class OtherEntries:
 
 _PARTS = 16
 """Rows between two nodes are pooled by sixteenths of the way and their means kept: probabilities differ by less than
-0.002 (docs/develop/decisions/0030-fitted-detection.md)."""
+0.002 (docs/develop/decisions/fitting.md)."""
 
 _APART = 0.05
 """Share of an axis by which a node keeps away from a frequent value, itself a node: nearer ones share its rows."""

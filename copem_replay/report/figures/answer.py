@@ -68,7 +68,7 @@ def answer_figure(results: Results, *, configurations: Sequence[str] | None = No
             panels = figure.subplots(1, count, squeeze=False, width_ratios=[1.5, 1.0] if share else None)[0]
         looks = choose_appearances(results)
         draw_rows(panels[0], list(zip(names, times, strict=True)), looks, named=not stacked)
-        panels[0].set_xlabel("Mean time to detection (s)")
+        panels[0].set_xlabel("Known after, mean (s)")
         _draw_truth_line(panels[0], {name: float(rows.loc[name, RANKED_BY]) for name in upper}, " s")
         _start_at_zero(panels[0], times)
         if share:

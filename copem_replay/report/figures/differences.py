@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 _PANELS = {
-    RANKED_BY: ("Mean time to detection (s)", 1.0, "sooner", "later"),
+    RANKED_BY: ("Known after, mean (s)", 1.0, "sooner", "later"),
     "pass_share": ("Passes (percentage points)", 100.0, "fewer", "more"),
     "detected_share": ("Detected (percentage points)", 100.0, "fewer", "more"),
 }

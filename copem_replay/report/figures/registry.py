@@ -74,7 +74,7 @@ def _no_sweep(results: Results, selection: Selection) -> str | None:
 FIGURES: dict[str, FigureKind] = {
     "answer": FigureKind(
         "The answer",
-        "mean time to detection and share that passes, a dot with its interval per configuration, the soonest first",
+        "mean time known after and share that passes, a dot with its interval per configuration, the soonest first",
         lambda results, of: answer_figure(results, configurations=of.configurations),
     ),
     "differences": FigureKind(
@@ -139,7 +139,7 @@ FIGURES: dict[str, FigureKind] = {
     ),
     "slices": FigureKind(
         "Which drive, which class",
-        "mean time to detection by group, a row per group and a column per configuration, darker is later",
+        "mean time known after by group, a row per group and a column per configuration, darker is later",
         lambda results, of: slices_figure(results, of.sliced, configurations=of.configurations, linked=of.linked),
         missing=lambda results, of: "" if of.sliced is None else None,
     ),

@@ -67,9 +67,7 @@ def slices_figure(
             _draw_cells(axes, table, most_s or 1.0, colours, links if by == "log" else {})
         horizon = sliced["ttd_rmst_horizon_s"].dropna()
         upto = f", at most {format_three_digits(float(horizon.iloc[0]))} s" if len(horizon) else ""
-        add_note(
-            figure, [f"Mean time to detection in seconds{upto}; darker is later", *_describe_left_out(tables, shown)]
-        )
+        add_note(figure, [f"Known after, mean, in seconds{upto}; darker is later", *_describe_left_out(tables, shown)])
     return figure
 
 

@@ -6,7 +6,6 @@ Cells have two decimals, shares three significant digits; `data-value` holds the
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +39,7 @@ from copem_replay.report.html.markup import (
     make_tag,
 )
 from copem_replay.results.compare.limits import ALONE, STAR
-from copem_replay.results.compare.tables import comparison_lines, explain_no_interval, held_cells
+from copem_replay.results.compare.tables import comparison_lines, explain_no_interval, held_cells, use_headers
 from copem_replay.results.verdicts import MET, NOT_MEASURED, NOT_MET, UNDECIDED, Judgement, Verdict
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ FIRST = ("ttd_rmst_s", "ttd_median_s", "ttd_p95_s", "detected_share")
 
 
 def column_header(name: str) -> str:
-    """The header of a column with its unit: `mean time to detection, s`."""
+    """The header of a column with its unit: `known after (mean), s`."""
     if name in _HEADERS:
         return _HEADERS[name]
     for end, unit in _UNITS.items():
@@ -197,7 +196,7 @@ def _interval_sentences(study: ReportData, columns: Iterable[str]) -> list[str]:
         lines = describe_intervals(rows, _INTERVALS[column])
         none = [f"no interval: too few logs, or objects of one log; {NOT_ENOUGH}"]
         words = [line.replace("95 %: ", "95 % ").replace("no 95 % of", "no 95 % interval of") for line in lines or none]
-        sentences += [_replace_metric_names(f"{strip_unit(column)}: {line}") for line in words]
+        sentences += [_make_sentence(f"{strip_unit(column)}: {line}") for line in words]
     horizon = rows["ttd_rmst_horizon_s"].dropna() if "ttd_rmst_s" in columns else pd.Series(dtype=float)
     if len(horizon):
         up_to = f"{format_three_digits(float(horizon.iloc[0]))} s"
@@ -245,7 +244,7 @@ def regret_table(study: ReportData) -> Html:
             *tables,
             make_tag(
                 "p",
-                f"Bold, {STAR}: the interval excludes 0, these tables together held at 95 %; {ALONE}: "
+                f"Bold, {STAR}: the interval excludes 0, these tables together at 95 %; {ALONE}: "
                 "its own interval alone excludes 0.",
                 class_="below",
             ),
@@ -253,7 +252,7 @@ def regret_table(study: ReportData) -> Html:
             fold_parts(
                 "What the columns mean, and how they are made",
                 _column_meanings(words, difference_column_header),
-                make_list(_replace_metric_names(line) for line in comparison_lines(regret)),
+                make_list(map(_make_sentence, comparison_lines(regret))),
             ),
         ]
     )
@@ -271,7 +270,7 @@ def _held_table(study: ReportData, regret: Comparison) -> Html:
         make_tag("tr", row_head(study, name), *(make_tag("td", cell) for cell in rest), data_row=name)
         for name, *rest in cells.itertuples(index=False)
     ]
-    caption = f"The newest list at every frame of the truth: of the configuration / of {regret.baseline}"
+    caption = f"The newest list at the frames of the truth: of the configuration / of {regret.baseline}"
     return make_table(list(cells.columns), lines, caption=caption, id_="regret-held") if lines else Html()
 
 
@@ -302,12 +301,9 @@ def _difference_cell(row: Any, metric: str) -> Html:
     )
 
 
-_METRIC_NAMES = re.compile("|".join(rf"\b{name}\b" for name in sorted(COMPARED, key=len, reverse=True)))
-
-
-def _replace_metric_names(line: str) -> str:
-    """A line of the comparison with headers of columns in place of their names."""
-    line = _METRIC_NAMES.sub(lambda match: strip_unit(match[0]), line)
+def _make_sentence(line: str) -> str:
+    """A line on a table, with headers of columns in place of their names."""
+    line = use_headers(line)
     return f"{line[:1].upper()}{line[1:]}."
 
 
@@ -432,7 +428,7 @@ def stage_table(study: ReportData) -> Html:
     note = (
         "Means over the rows in which the object is detected; how many these are, where not all, is beside the bar. "
         "Rows without detection have no stages, so bars of configurations that miss many objects are over other rows, "
-        "and their sum is not the mean time to detection."
+        "and their sum is not the mean time after which it is known."
     )
     terms = [part for stage in stages for part in (make_tag("dt", stage), make_tag("dd", STAGES[stage]))]
     below = fold_parts("What the stages are", make_tag("dl", *terms))

@@ -78,7 +78,7 @@ def comparison_markdown(comparison: Comparison) -> str:
     """The comparison as Markdown: its table, lines and notes as a list, what errors are over; ends with a newline."""
     comparison = comparison.changed
     held, notes = held_cells(comparison), (f"note: {note}" for note in comparison.notes)
-    lines = [f"- {escape_markdown(line)}" for line in (*comparison_lines(comparison), *notes)]
+    lines = [f"- {escape_markdown(use_headers(line))}" for line in (*comparison_lines(comparison), *notes)]
     below = ["", *_markdown_rows(held)] if len(held) else []
     if comparison.groups is not None:
         for by, rows in comparison.groups.groupby("by", sort=False):
@@ -89,8 +89,16 @@ def comparison_markdown(comparison: Comparison) -> str:
 
 
 def _markdown_rows(cells: pd.DataFrame) -> Iterator[str]:
-    for row in (list(cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)):
+    for row in (map(use_headers, cells.columns), ["---"] * len(cells.columns), *cells.itertuples(index=False)):
         yield "| " + " | ".join(escape_markdown(str(cell)) for cell in row) + " |"
+
+
+_NAMES = re.compile("|".join(rf"\b{name}\b" for name in sorted(COMPARED, key=len, reverse=True)))
+
+
+def use_headers(line: str) -> str:
+    """A line of the comparison with headers of columns, without units, in place of their names in files."""
+    return _NAMES.sub(lambda found: COMPARED[found[0]].header.partition(", ")[0], line)
 
 
 def check_out(path: Path) -> None:
@@ -165,8 +173,8 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Lines on the table: its meaning, and the configurations that are better than the baseline."""
     overall = comparison.overall
     shown = set(overall["metric"])
-    of_lists = "accuracy is of the newest list at each frame"
-    yield f"differences to {comparison.baseline}, paired by log, object and run; {of_lists}"
+    how = "paired by log, object and run; accuracy of the newest list at each frame"
+    yield f"differences to {comparison.baseline}, {how}"
     if comparison.unchanged:
         yield f"unchanged: {', '.join(comparison.unchanged)}"
     if comparison.baseline_why is not None:
@@ -203,7 +211,7 @@ def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]
     if decide is not None:
         yield f"decided by {decide}, named beforehand: no other column has a {STAR}"
     if (rows["star"] == STAR).any():
-        yield f"{STAR}: the interval excludes 0, {together} held at 95 %"
+        yield f"{STAR}: the interval excludes 0, {together} at 95 %"
     if (rows["star"] == ALONE).any():
         yield f"{ALONE}: its own interval alone excludes 0; of {number} such 1 in 20 does by chance"
     over_logs = rows.loc[rows["interval_over"] == "logs", "clusters"]
