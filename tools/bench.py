@@ -49,7 +49,8 @@ def main(names: list[str]) -> None:
     known = {bench.__name__: bench for bench in BENCHES}
     if names[:1] == [TABLE]:
         printed = subprocess.check_output([sys.executable, __file__, *names[1:]], text=True)
-        print("\n".join(tabulate([json.loads(line) for line in printed.splitlines()])))
+        said = [line for line in printed.splitlines() if line.startswith("{")]  # peers print words of their own
+        print("\n".join(tabulate([json.loads(line) for line in said])))
         return
     alone = names[:1] == [ALONE]
     if unknown := [name for name in names[alone:] if name not in known]:

@@ -3,7 +3,8 @@
 A kernel is `numba.njit(cache=True, nogil=True)`; `core/kernel_cache.py` says where its code is cached. A callee is
 `numba.extending.register_jitable`: Numba compiles it into each kernel that calls it, for numbers and not for literals,
 without the wrapper by which Python would call it and without files of its own in the cache. Called by Python it is
-the Python function.
+the Python function. A kernel is handed arrays that are contiguous, or never are: each layout is compiled for itself,
+and a part of one row is contiguous, where one of more rows is not.
 
 At each call Numba counts, atomically, references to each array that is handed over. For a function called for each
 entry this takes several times as long as its work. `borrowing` and `making` say whether references are counted;

@@ -232,18 +232,17 @@ def test_stone_soup_is_a_peer_where_it_is_installed(once: None) -> None:
 
 
 def test_without_peers_lines_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    libraries = {"gospa_vs_stonesoup": "stonesoup", "tracker_vs_stonesoup": "stonesoup",
-                 "tracker_vs_norfair": "norfair", "tracker_vs_filterpy": "filterpy",
-                 "matches_vs_motmetrics": "motmetrics", "matches_vs_trackeval": "trackeval"}  # fmt: skip
-    for name in [name for name in sys.modules if name.partition(".")[0] in libraries.values()]:
+    libraries = {"stonesoup", "norfair", "filterpy", "motmetrics", "trackeval", "mcap_ros2", "mcap_ros2_support_fast"}
+    for name in [name for name in sys.modules if name.partition(".")[0] in libraries]:
         monkeypatch.delitem(sys.modules, name)
-    for library in libraries.values():
+    for library in libraries:
         monkeypatch.setitem(sys.modules, library, None)
-    found = {name: line for line in peers.peers() for name in libraries if name in line}
-    assert list(found) == list(libraries)
-    for name, line in found.items():
-        assert line[name] is None
-        assert "is not installed: see tools/benches/peers.py" in line["why"]
+    found = list(peers.peers())
+    assert len(found) == 8
+    assert {line["peer"] for line in found} == libraries
+    for line in found:
+        assert line["ratio"] is None
+        assert line["found"] == f"{line['peer']} is not installed: see tools/benches/peers.py"
 
 
 def test_paper_counts_and_what_stands_beside_them() -> None:
