@@ -143,8 +143,8 @@ def run_floor(parts: Parts, keep: Path, words: list[str]) -> None:
         with suppress(Exception):  # such as modules that C code makes: they come with those that have them
             importlib.import_module(name)
     parts.go_on(END)
-    with parts.of(READ):
-        for path in words:
+    for path in words:
+        with parts.of(READ):
             read_plainly(Path(path))
     for path, part, write in (("messages", MCAP, write_plainly), ("boxes", RRD, send_plainly)):
         if (keep / path).exists():
