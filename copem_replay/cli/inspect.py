@@ -136,8 +136,9 @@ def check(
     for line in list_began(replays, study.experiment):
         print_line(line)
     print_line(f"{experiment}: no problem found; logs: {', '.join(r.scene.log for r in study.recordings)}")
-    for unit in study.experiment.recorded if has_extra("preview", "fit") else ():
-        for line in load_extra("preview", "fit")(study.experiment, study.recordings, unit):
+    for unit in study.experiment.recorded:
+        preview = load_extra("preview", "fit") if has_extra("preview", "fit") else lambda *of: ()
+        for line in preview(study.experiment, study.recordings, unit):
             print_line(line)
     return 0
 

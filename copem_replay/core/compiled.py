@@ -3,11 +3,11 @@
 A kernel is `numba.njit(cache=True, nogil=True)`; `core/kernel_cache.py` says where its code is cached. A callee is
 `numba.extending.register_jitable`: Numba compiles it into each kernel that calls it, for numbers and not for literals,
 without the wrapper by which Python would call it and without files of its own in the cache. Called by Python it is
-the Python function.
+the Python function. A kernel gets arrays of one layout: each is compiled for itself, and of one row any is contiguous.
 
 At each call Numba counts, atomically, references to each array that is handed over. For a function called for each
-entry this takes several times as long as its work. `borrowing` and `making` say whether references are counted;
-functions that are called inherit it: docs/develop/decisions/speed.md.
+entry this takes several times its work. `borrowing` and `making` say whether references are counted, and functions that
+are called inherit it: docs/develop/decisions/speed.md.
 """
 
 from __future__ import annotations
@@ -114,9 +114,7 @@ def call_in_room(
 ) -> Result:
     """Call the function on a stack chunk of half a MiB for Python's frames, and return its result.
 
-    Python allocates frames in chunks of 16 KiB and frees a chunk as soon as its first frame ends. Calls that go back
-    and forth over a chunk's end, half a million times while compiling, would each ask the system for memory. Chunks are
-    per thread: docs/develop/decisions/speed.md
+    Else compiling crosses the end of a 16-KiB chunk half a million times, each with a call to the system for memory.
     """
     return function(*arguments, **named)
 

@@ -154,7 +154,7 @@ class FusedTracks:
     def class_of(self, scene: Scene) -> Int:
         """(P,) index into CLASSES: the true class, or the most probable one by the fusion."""
         if self.said is not None:
-            likely: Int = most_probable_classes(self.said["class_probability"])
+            likely: Int = most_probable_classes(np.ascontiguousarray(self.said["class_probability"]))
             return likely
         classes: Int = scene.object_class[self.fused.row_object_ix].astype(np.int64)
         return classes

@@ -51,7 +51,8 @@ def fuse_ideal(
     valid = _any_valid(counts, rows, start)
     out = {name: np.full(valid.shape, np.nan) for name in ("x_m", "y_m", "cov_ee_m2", "cov_en_m2", "cov_nn_m2")}
     weighed = WeightedRows.of(received)
-    positions = Positions(received.x_m, received.y_m, *weighed.covariances)
+    x_m, y_m = map(np.ascontiguousarray, (received.x_m, received.y_m))  # of one layout, compiled once
+    positions = Positions(x_m, y_m, *weighed.covariances)
     _combine_position(counts, positions, weighed.information, rows, start, Positions(*out.values()))
     spread = _combine_scalars(received, counts, weighed, rows, start, out)
     captured = np.where(instants.newest >= 0, received.captured_s[instants.newest], -np.inf).max(

@@ -286,9 +286,8 @@ def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:
     np.minimum.at(first_s, which, np.append(inputs.arrives_s, inputs.arrives_s[frame]))
     arrived: Bool = np.zeros(len(answer.entries), dtype=bool)
     if len(captured_s):
-        _mark_arrived(
-            answer.start, answer.entries["captured_s"], inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, arrived
-        )
+        entry_s = np.ascontiguousarray(answer.entries["captured_s"])
+        _mark_arrived(answer.start, entry_s, inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, arrived)
     return arrived
 
 

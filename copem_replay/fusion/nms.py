@@ -44,7 +44,7 @@ class Nms(ListFusion):
             bounds = run - run[0]
             entries = inputs.lists.entries[run[0] : run[-1]]
             start, rows = gather_newest_rows(bounds, inputs.newest, entries["existence"] >= self.min_existence)
-            kind = most_probable_classes(entries["class_probability"])
+            kind = most_probable_classes(np.ascontiguousarray(entries["class_probability"]))
             # Entries closer than the sum of their reaches: boxes may overlap, centres are within the radius.
             reach_m = np.full(len(entries), self.radius_m / 2)
             if self.by == "iou":

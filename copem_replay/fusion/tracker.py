@@ -129,5 +129,5 @@ def _gather_lists(inputs: Inputs, run: int) -> HeardLists:
     lists = inputs.lists
     entries = np.ascontiguousarray(lists.entries[lists.start[run, 0] : lists.start[run, -1]])
     start = lists.start[run] - lists.start[run, 0]
-    content = view_as_numbers(entries)[:, :WIDTH]
+    content = np.ascontiguousarray(view_as_numbers(entries)[:, :WIDTH])  # else one row has another type, compiled anew
     return HeardLists(start, order_by_content(start, content), entries, content, inputs.captured_s, inputs.unit_ix)

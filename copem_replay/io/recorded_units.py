@@ -297,7 +297,7 @@ def assign_truth_ids(
             allowed[:, ego] = False
         partner = np.full(len(rows), -1)
         worth = (away_m - (gate_m + 2e-9)) * np.where(agrees, 1.0, confused)
-        assign(np.where(allowed, worth, np.inf), partner)
+        assign(np.ascontiguousarray(np.where(allowed, worth, np.inf)), partner)
         object_ix[rows[partner >= 0]] = world.row_object_ix[bodies[partner[partner >= 0]]]
     return replace(tracks, object_ix=object_ix)
 

@@ -24,6 +24,7 @@ from copem_replay.core.object_list import (
 from copem_replay.core.tracks import AGREE, CLASSES
 from copem_replay.fusion.interface import ask_fusion
 from copem_replay.fusion.tracker import Tracker
+from copem_replay.fusion.tracker_kernel import track_run
 from tests.helpers.reports import entry, inputs_of, joined, lists_of
 from tests.oracles.gnn import largest_around
 
@@ -777,3 +778,11 @@ def test_published_is_what_is_claimed_above_the_threshold(late: str):
     for claimed, count in ((0.5, 0), (0.5 + 1e-12, 1)):
         inputs = inputs_of([[entry(0.0, existence=claimed)]], ["a"], [0.0], [0.0])
         assert len(fuse_one(inputs, late=late, publish=0.5, **AT_ONCE)[0]) == count
+
+
+def test_lists_of_one_entry_need_no_other_code():
+    """A part of the columns of one row is contiguous, of more rows it is not: Numba compiles for each."""
+    two = joined(*(entry(x_m=30.0 * k) for k in range(2)))
+    for count in (2, 1, 0):
+        fuse(inputs_of([[two[:count]]], ["a"], [0.0], [0.1]))
+    assert len(track_run.signatures) == 1

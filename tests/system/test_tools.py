@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rerun.chunk import RrdReader
 from scipy.stats import binom
 
 from copem_replay.experiment.file import read_experiment_file
@@ -29,7 +32,7 @@ import knows_first  # noqa: E402
 import lidar_visibility  # noqa: E402
 import make_logs  # noqa: E402
 import paper  # noqa: E402
-from benches import common, fit, fusion, long, memory, peers, reading, scaling  # noqa: E402
+from benches import common, fit, floor, fusion, long, memory, parts, peers, reading, scaling  # noqa: E402
 
 
 def test_no_fusion_of_a_sample_knows_first() -> None:
@@ -159,7 +162,7 @@ def test_benchmarks_print_json_lines(
 
 
 def test_a_benchmark_that_there_is_not() -> None:
-    with pytest.raises(SystemExit, match=r"^expected some of compile, pieces, .*; found writting$"):
+    with pytest.raises(SystemExit, match=r"^expected some of floor, compile, .*; found writting$"):
         bench.main(["paper", "writting"])
 
 
@@ -229,18 +232,19 @@ def test_stone_soup_is_a_peer_where_it_is_installed(once: None) -> None:
 
 
 def test_without_peers_lines_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    libraries = {"gospa_vs_stonesoup": "stonesoup", "tracker_vs_stonesoup": "stonesoup",
-                 "tracker_vs_norfair": "norfair", "tracker_vs_filterpy": "filterpy",
-                 "matches_vs_motmetrics": "motmetrics", "matches_vs_trackeval": "trackeval"}  # fmt: skip
-    for name in [name for name in sys.modules if name.partition(".")[0] in libraries.values()]:
+    libraries = {"stonesoup", "norfair", "filterpy", "motmetrics", "trackeval", "mcap_ros2", "mcap_ros2_support_fast"}
+    for name in [name for name in sys.modules if name.partition(".")[0] in libraries]:
         monkeypatch.delitem(sys.modules, name)
-    for library in libraries.values():
+    for library in libraries:
         monkeypatch.setitem(sys.modules, library, None)
-    found = {name: line for line in peers.peers() for name in libraries if name in line}
-    assert list(found) == list(libraries)
-    for name, line in found.items():
-        assert line[name] is None
-        assert "is not installed: see tools/benches/peers.py" in line["why"]
+    found = list(peers.peers())
+    assert len(found) == 8
+    assert {line["peer"] for line in found} == libraries
+    for line in found:
+        assert line["ratio"] is None
+        missing, _, rest = str(line["found"]).partition(" ")
+        assert missing.partition(".")[0] == line["peer"]
+        assert rest == "is not installed: see tools/benches/peers.py"
 
 
 def test_paper_counts_and_what_stands_beside_them() -> None:
@@ -328,3 +332,80 @@ def test_a_crowd_is_timed(tmp_path: Path) -> None:
     line = long.crowded(tmp_path, 5, 4)
     assert line["crowd_views"] == 5 * 4 * 3
     assert all(value > 0 for value in line.values())
+
+
+def test_each_second_is_of_one_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By hand: 1 s until reading, 2 s of reading and 4 s of replay in it, 8 s at the end."""
+    clock = [10.0]
+    monkeypatch.setattr(parts.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(parts.time, "process_time", lambda: (clock[0] - 10) / 2)
+
+    def take(seconds: float) -> None:
+        clock[0] += seconds
+
+    found = parts.Parts(10.0)
+    take(1)
+    with found.of(parts.READ):
+        take(2)
+        found.counted(take, parts.REPLAY)(4)
+        with found.of(parts.NOT_COUNTED), found.of(parts.READ):
+            take(100)
+    found.go_on(parts.END)
+    take(8)
+    found.go_on(parts.END)
+    took = {part: seconds for part, (seconds, _) in found.took.items()}
+    assert took == {parts.START: 1, parts.READ: 2, parts.REPLAY: 4, parts.NOT_COUNTED: 100, parts.END: 8}
+    assert [cpu_s * 2 for _, cpu_s in found.took.values()] == list(took.values())
+
+
+def test_a_floor_reads_and_writes_the_same(tmp_path: Path) -> None:
+    world, out = common.boxes(5, 7), tmp_path / "out"
+    common.write_truth(tmp_path / "b.mcap", world)
+    assert parts.read_plainly(tmp_path / "b.mcap") == 35
+    parts.keep_messages(tmp_path / "b.mcap", tmp_path / "messages")
+    parts.write_plainly(tmp_path / "messages", out)
+    said = []
+    for path in (tmp_path / "b.mcap", out):
+        with path.open("rb") as file:
+            said.append([(s.name, c.topic, m) for s, c, m in make_reader(file).iter_messages()])
+    assert len(said[0]) == 5
+    assert said[0] == said[1]
+    (tmp_path / "first").mkdir()
+    centres = np.arange(21, dtype=np.float32).reshape(7, 3)
+    columns = [("/a", np.arange(3).astype("timedelta64[ns]"), np.array([2, 0, 5]), centres, centres, centres[:, 0] / 9)]
+    (tmp_path / "first/columns").write_bytes(pickle.dumps(columns))
+    parts.send_plainly(tmp_path / "first", out)
+    (chunk,) = (one for one in RrdReader(str(out)).stream() if one.entity_path == "/a")
+    row = chunk.to_record_batch().to_pydict()
+    assert [len(boxes) for boxes in row["Boxes3D:centers"]] == [2, 0, 5]
+    assert np.concatenate(row["Boxes3D:centers"][::2]).tolist() == centres.tolist()
+
+
+def test_ratios_to_the_floor_by_hand() -> None:
+    several = [{"read": (2.0, 3.0), "all": (9.0, 9.0)}, {"read": (4.0, 1.0), "end": (5.0, 5.0), "all": (9.0, 8.0)}]
+    assert floor.least(several) == {"read": [2.0, 1.0], "all": [9.0, 8.0], "end": [5.0, 5.0]}
+    job = next(one for one in floor.JOBS if one.name == "drive")
+    took = {
+        "": {"read": (2.0, 1.0), "replay": (7.0, 7.0), "all": (9.0, 8.0)},
+        "floor_": {"read": (0.5, 0.5), "all": (3.0, 4.0)},
+    }
+    read, replay, together = floor.lines(job, took)
+    assert (read["ratio"], read["cpu_ratio"], read["goal"]) == (4, 2, None)
+    assert (replay["s"], replay["floor_s"], replay["ratio"]) == (7, 0, None)
+    assert (together["ratio"], together["cpu_ratio"], together["goal"]) == (3, 2, 1.6)
+    assert bench.tabulate([{"section": "a"}, {"a": 1, "b": None}, {"c": 2}, {"a": 3, "b": "x"}]) == [
+        "| a | b |", "|---|---|", "| 1 |  |", "| 3 | x |", "", "| c |", "|---|", "| 2 |",
+    ]  # fmt: skip
+
+
+@pytest.mark.long
+def test_commands_are_held_against_their_floors() -> None:
+    """Each part of `run`; and of `report`, whose floor draws the figures."""
+    lines = {(line["job"], line["part"]): line for line in floor.floor(("demo", "report"), times=1)}
+    asked = (parts.START, parts.READ, parts.REPLAY, parts.TABLES, parts.MCAP, parts.RRD, parts.END)
+    assert [part for job, part in lines if job == "demo"] == [*asked, "all"]
+    for line in lines.values():
+        assert line["cpu_s"] >= 0
+    for part in (parts.START, parts.MCAP, "all"):
+        assert lines["demo", part]["floor_cpu_s"] > 0
+    assert lines["report", parts.WORK]["floor_cpu_s"] > 0

@@ -4,7 +4,8 @@ Stone Soup is among the packages of `bench`. norfair, filterpy, motmetrics and T
 and pandas than ours, and run with these all the same: they stand in a folder of their own,
 
     pip install --no-deps --target build/peers norfair==2.3.0 filterpy==1.4.5 motmetrics==1.4.0 trackeval==1.3.0
-    PYTHONPATH=build/peers python tools/bench.py peers
+    pip install --no-deps --target build/peers mcap-ros2-support-fast==0.8.0 ros-parser lark
+    PYTHONPATH=build/peers python tools/bench.py --table peers
 
 What is not there has a line that says so.
 """
@@ -14,15 +15,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
+from typing import Any
 
 import numba as nb
 import numpy as np
 
 from benches import common
 from benches.fusion import GATE, PERIOD_S, scene
+from benches.reading import STATES, sum_decoded, write_tracked
 from copem_replay.core.object_list import Inputs, ObjectLists
 from copem_replay.core.tracks import CLASSES, TRUTH, Float, Scene, Tracks
 from copem_replay.fusion.tracker import Tracker
+from copem_replay.io.recording import read_log
 from copem_replay.metrics.gospa import gospa, gospa_pairs
 from copem_replay.metrics.matching import GHOST, MATCH, Matches, match_entries
 from copem_replay.metrics.origin import GoesBack, OriginLists, Origins
@@ -32,15 +36,22 @@ _NEAR_M = 3.0  # of an object: farther entries are false
 
 
 def peers() -> Iterator[common.Line]:
-    """GOSPA and tracks against Stone Soup, norfair and filterpy; matches against motmetrics and TrackEval."""
+    """How many times as long as ours each peer takes for the same work, and what both found, a line for each.
+
+    GOSPA and tracks: Stone Soup, norfair and filterpy; matches: motmetrics and TrackEval; ROS 2: readers of MCAP.
+    """
     for bench in (
         gospa_vs_stonesoup, tracker_vs_stonesoup, tracker_vs_norfair, tracker_vs_filterpy, matches_vs_motmetrics,
-        matches_vs_trackeval,
+        matches_vs_trackeval, reading_vs_mcap_ros2, reading_vs_mcap_ros2_support_fast,
     ):  # fmt: skip
+        work, _, peer = bench.__name__.partition("_vs_")
         try:
-            yield from bench()
+            for line in bench():
+                found = ", ".join(f"{key} {value}" for key, value in line.items() if key != bench.__name__)
+                yield {"work": work, "peer": peer, "ratio": line[bench.__name__], "found": found}
         except ImportError as error:
-            yield {bench.__name__: None, "why": f"{error.name} is not installed: see tools/benches/peers.py"}
+            found = f"{error.name} is not installed: see tools/benches/peers.py"
+            yield {"work": work, "peer": peer, "ratio": None, "found": found}
 
 
 # ---------------------------------------------------------------------------------------------------------- Stone Soup
@@ -350,3 +361,34 @@ def _compare_matches(
         f"{peer}_false": false_there,
         "ghosts": int((ours().role == GHOST).sum()),
     }
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+
+
+def reading_vs_mcap_ros2() -> Iterator[common.Line]:
+    """A recording of TrackedObjects read to tracks, against mcap-ros2-support, places touched."""
+    from mcap_ros2.decoder import DecoderFactory
+
+    yield from _compare_reading("reading_vs_mcap_ros2", DecoderFactory)
+
+
+def reading_vs_mcap_ros2_support_fast() -> Iterator[common.Line]:
+    """The same against mcap-ros2-support-fast."""
+    from mcap_ros2_support_fast.decoder import DecoderFactory
+
+    yield from _compare_reading("reading_vs_mcap_ros2_support_fast", DecoderFactory)
+
+
+def _compare_reading(name: str, factory: Callable[[], Any]) -> Iterator[common.Line]:
+    with common.scratch() as folder:
+        path = write_tracked(folder / "tracked.mcap")
+        truth = read_log(path, name="tracked").truth
+
+        def theirs() -> float:
+            return sum_decoded(path, factory())
+
+        off = abs(theirs() - float(truth.x_m[truth.valid].sum()))
+        assert off < 1e-3, f"{off} m apart"
+        seconds, peer_seconds = common.best(lambda: read_log(path, name="tracked"), 3), common.best(theirs, 1)
+    yield {name: round(peer_seconds / seconds, 1), "objects_per_s": round(STATES / seconds)}

@@ -53,7 +53,6 @@ DEFINITION = "\n".join(
 
 def by_format(folder: Path, osi: Path) -> Iterator[common.Line]:
     """Objects per second of each format (`osi`: the same as ground truth), and ROS 2 against mcap-ros2-support."""
-    from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
     yield _line("osi", common.best(lambda: read_log(osi, name="osi"), 3))
@@ -63,16 +62,24 @@ def by_format(folder: Path, osi: Path) -> Iterator[common.Line]:
     }.items():
         path = _written(folder / f"{name}.mcap", "foxglove.SceneUpdate", encoding, schema, payloads)
         yield _line(name, common.best(lambda path=path: read_log(path, name="scene"), 3))
-    path = _written(folder / "tracked.mcap", _TRACKED, "cdr", ("ros2msg", DEFINITION.encode()), _tracked())
+    path = write_tracked(folder / "tracked.mcap")
     ours = common.best(lambda: read_log(path, name="tracked"), 3)
+    theirs = common.best(lambda: sum_decoded(path, DecoderFactory()), 1)
+    yield _line("tracked_objects", ours) | {"times_mcap_ros2_support": round(theirs / ours, 1)}
 
-    def theirs() -> float:
-        """Every message decoded, and the places of its objects touched."""
-        with path.open("rb") as file:
-            messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-            return sum(o.kinematics.pose_with_covariance.pose.position.x for *_, m in messages for o in m.objects)
 
-    yield _line("tracked_objects", ours) | {"times_mcap_ros2_support": round(common.best(theirs, 1) / ours, 1)}
+def write_tracked(path: Path) -> Path:
+    """Write a recording of TrackedObjects."""
+    return _written(path, _TRACKED, "cdr", ("ros2msg", DEFINITION.encode()), _tracked())
+
+
+def sum_decoded(path: Path, factory: Any) -> float:
+    """Every message decoded by a peer, and the places of its objects touched: their sum, x in m."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        messages = make_reader(file, decoder_factories=[factory]).iter_decoded_messages()
+        return float(sum(o.kinematics.pose_with_covariance.pose.position.x for *_, m in messages for o in m.objects))
 
 
 def _line(name: str, seconds: float) -> common.Line:

@@ -338,23 +338,25 @@ class GroundTruthDecoder:
         return tuple(ids), moving
 
 
-_PARTS = ("position", "position", "position", "orientation", "velocity", "velocity")
-_LEAVES = ("x", "y", "z", "yaw", "x", "y")
-
-
 def check_zeros(base: Any, values: tuple[float, ...]) -> tuple[tuple[float, ...], list[str]]:
     """x, y, z, yaw (vx, vy) of an object, NaN for a place and a velocity that are not said, and the rules that apply.
 
     Some writers leave a number out where it is 0. Presence costs, so it is asked only of zeros.
     """
-    rules, has_part = [], {name: base.HasField(name) for name in dict.fromkeys(_PARTS[: len(values)])}
-    if not has_part["orientation"]:
-        rules.append("yaw unset")
-    zeros = [k for k, value in enumerate(values) if value == 0.0 and has_part[_PARTS[k]]]
-    if any(not getattr(base, _PARTS[k]).HasField(_LEAVES[k]) for k in zeros):
+    has = base.HasField
+    x, y, z, yaw, *speed = values
+    has_place, has_turn, has_velocity = has("position"), has("orientation"), bool(speed) and has("velocity")
+    rules = [] if has_turn else ["yaw unset"]
+    lacks = has_turn and yaw == 0.0 and not base.orientation.HasField("yaw")
+    if has_place and not lacks:
+        has = base.position.HasField
+        lacks = (z == 0.0 and not has("z")) or (x == 0.0 and not has("x")) or (y == 0.0 and not has("y"))
+    if has_velocity and not lacks:
+        has = base.velocity.HasField
+        lacks = (speed[0] == 0.0 and not has("x")) or (speed[1] == 0.0 and not has("y"))
+    if lacks:
         rules.append("zero unset")
-    x = values[0] if has_part["position"] else _NAN
-    return (x, *values[1:4], *(values[4:] if has_part.get("velocity", True) else (_NAN, _NAN))), rules
+    return (x if has_place else _NAN, y, z, yaw, *(speed if has_velocity else [_NAN] * len(speed))), rules
 
 
 def osi_id(object_id: str) -> int:

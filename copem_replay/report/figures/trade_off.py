@@ -128,20 +128,25 @@ def _sweep_existence(results: Results, name: str) -> tuple[Float, Float] | None:
     existence, share = existence[some], share[some]
     if len(existence) < 2:
         return None
-    mean_s = np.array([_mean_time_s(results, name, steps[steps["existence"] >= at], horizon_s) for at in existence])
+    mean_s = _mean_times_s(results, name, steps, existence, horizon_s)
     new = np.concatenate([[True], (np.diff(mean_s) != 0) | (np.diff(share) != 0)])
     return (mean_s[0] - mean_s[new], share[new]) if new.sum() > 1 and share.any() else None
 
 
-def _mean_time_s(results: Results, name: str, steps: pd.DataFrame, horizon_s: float) -> float:
-    """The restricted mean time to detection of the rows that count, by these steps of existence alone."""
-    times, endings = list[Float](), list[np.ndarray]()
+def _mean_times_s(results: Results, name: str, steps: pd.DataFrame, existence: Float, horizon_s: float) -> Float:
+    """(T,) restricted mean time to detection of the rows that count, by steps of at least each existence alone."""
+    found = [(list[Float](), list[np.ndarray]()) for _ in existence]
     for log in results.rows.logs:
         (rows,) = results.each("configuration", *_KEYS, "onset_s", "ended_s", "ended_by", log=log)
-        rows = rows[rows["configuration"] == name]
-        first_s = steps[steps["log"] == log].groupby(_KEYS, sort=False)["detection_s"].min()
-        known_s = first_s.reindex(pd.MultiIndex.from_frame(rows[_KEYS])).to_numpy(dtype=float)
-        time_s, ending = detection_endings(rows.assign(time_to_detection_s=known_s - rows["onset_s"].to_numpy()))
-        times.append(np.round(time_s, 9))
-        endings.append(ending)
-    return restricted_mean(*cumulative_incidence(np.concatenate(times), np.concatenate(endings)), horizon_s)
+        rows, of_log = rows[rows["configuration"] == name], steps[steps["log"] == log]
+        place = pd.MultiIndex.from_frame(rows[_KEYS]).get_indexer(pd.MultiIndex.from_frame(of_log[_KEYS]))
+        detection_s, onset_s = of_log["detection_s"].to_numpy(), rows["onset_s"].to_numpy()
+        for at, (times, endings) in zip(existence, found, strict=True):
+            here = (place >= 0) & (of_log["existence"].to_numpy() >= at)
+            known_s = np.full(len(rows), np.nan)
+            np.fmin.at(known_s, place[here], detection_s[here])
+            time_s, ending = detection_endings(rows.assign(time_to_detection_s=known_s - onset_s))
+            times.append(np.round(time_s, 9))
+            endings.append(ending)
+    rounded = ((np.concatenate(times), np.concatenate(endings)) for times, endings in found)
+    return np.array([restricted_mean(*cumulative_incidence(*each), horizon_s) for each in rounded])
