@@ -166,7 +166,10 @@ class JointWays:
                 break
 
     def _round(self, *, start: bool) -> None:
-        """One step of the fit with the present weights, and new weights; `start`: without paths from a former round."""
+        """Solve for the coefficients and all paths, then reweigh; `start`: no paths from a former round.
+
+        Axes: a along and across, k entries, p pieces, t terms of a path's polynomial, c coefficients.
+        """
         p, piece = self.pieces, self.pieces.of
         terms, rates = _polynomial_terms(p.time_s - p.other * self.offset_s, piece, p.middle_s, p.half_s)
         weight = self._weight / self._scale_m[:, p.other.astype(np.int64)] ** 2

@@ -148,7 +148,7 @@ def _filter_sequences(
 
 @kernel
 def _filter_sequence(listed: Float, held: Bool, log_same: Float, share: Float, edges: Float, out: Float) -> None:
-    """Fill `out (P,)` as `log_sequence` has it. `edges`: the density of U is constant between them, 0 … 1.
+    """Fill `out (P,)`: ln of the probability of each hit (`held`) or miss after the former. `edges`: U is even between.
 
     `log_same (P,)`: ln φ. After a list that is impossible, −inf, the rest of `out` stays 0.
     """

@@ -289,7 +289,7 @@ class StudyRows:
         ]
 
     def inputs(self, configuration: str) -> MetricInputs:
-        """The inputs of a configuration's statistics, as for a row of `summary.csv`."""
+        """The rows of a configuration in this group, from which the figures of `summary.csv` are computed."""
         settings, rows_of = self.settings, self._of(configuration)
         conflicts = rows_of(self.counted[self.counted["event"] == CONFLICT]) if settings.conflicts else None
         return MetricInputs(

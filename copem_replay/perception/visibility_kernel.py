@@ -156,10 +156,10 @@ def compute_shares(
     f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Bool, flat: bool, out: Float,
     blocker: Int,
 ) -> None:  # fmt: skip
-    """Visible shares `out (U, P)` of the lists f0 … f1 − 1, where they are `asked` for.
+    """Fill `out (U, P)`, U units by P rows of bodies, with visible shares 0 … 1 in frames f0 … f1 − 1, where `asked`.
 
-    `blocker (U, P)`, unless empty, becomes the row of the body that alone would hide most of each row, −1 where none
-    hides any of it, −2 − k for the obstacle k.
+    `flat`: heights do not count. `blocker (U, P)`, unless empty, gets the row of the body that by itself hides most of
+    the row: −1 where nothing hides it, −2 − k for the obstacle k.
     """
     units, count = len(places.carrier_ix), len(obstacles.body)
     most = int(np.diff(boxes.bounds[f0 : f1 + 1]).max(initial=0)) + count

@@ -410,7 +410,7 @@ _RECORDS = {"episodes": OBJECT, "runs": RUN, "ghosts_at": np.dtype("i8"), "by_di
 
 
 def pack_part(part: PartTables, about: str = "") -> bytes:
-    """A part as bytes. `about`: text that `unpack_part` expects."""
+    """The tables of a part of a study as bytes. `about`: its recipe; `unpack_part` refuses bytes of another."""
     total = None if part.total is None else _total_as_json(part.total)
     metadata: dict[bytes, bytes] | None = {b"about": about.encode(), b"total": json.dumps(total).encode()}
     stream = pa.BufferOutputStream()

@@ -353,7 +353,7 @@ class _JudgedStudy:
     def _make_figure_rows(
         self, group: _JudgedGroup, kind: str, configuration: str, weigh: str, *, of_runs: bool
     ) -> tuple[FigureRows | None, JudgedFigure]:
-        """The rows of a kind with their clusters; without rows None. What is known beforehand of their figures."""
+        """The rows of `kind` with clusters (None: no rows), and the figure but for its value: n and clusters."""
         study, exact = group.rows, kind.startswith("exact")
         table = self._split_table(group, "exact" if exact else kind).get(configuration)
         if table is None or not len(table):
@@ -366,16 +366,16 @@ class _JudgedStudy:
         n = round(float(weight.sum()))
         facts = study.settings.facts[configuration]
         if of_runs and (exact or (facts.fixed_verdicts if kind == "braking" else facts.fixed)):
-            known = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
-            return FigureRows(table, weight, None), JudgedFigure(known, n=n)
+            certain = LimitedFigure(None, kind=CLOSED_FORM if exact else NOTHING_DRAWN)
+            return FigureRows(table, weight, None), JudgedFigure(certain, n=n)
         clusters, why = find_judged_clusters(table, of_runs=of_runs, weigh=weigh)
         runs = float(self.results.provenance.runs)
-        least = 1.0 / max(n * runs, 1.0) if exact else 1e-12
+        least_share = 1.0 / max(n * runs, 1.0) if exact else 1e-12
         basis = JudgedFigure(LimitedFigure(None), n=n, why=why)
         if clusters is not None:
             units = clusters.count if clusters.once else clusters.units
             basis = replace(basis, over=clusters.over, clusters=clusters.count, units=units)
-        return FigureRows(table, weight, clusters, least, facts.least_s), basis
+        return FigureRows(table, weight, clusters, least_share, facts.least_s), basis
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
         """By configuration the rows of a group that count."""

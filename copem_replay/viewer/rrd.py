@@ -238,7 +238,7 @@ def _open_streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | No
 
 
 def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]) -> None:
-    """Write everything that does not depend on fused tracks; a running viewer gets the layout, too."""
+    """Write what is written once, before fused tracks; `run_is`: the run in words, `further`: names of other files."""
     import rerun as rr
 
     out, content = file.out, file.content

@@ -168,7 +168,7 @@ def _draft_logs(drives: Sequence[_Drive], units: Sequence[str], recorded: Mappin
 
 
 def _draft_own_units(drive: _Drive, units: Sequence[str], recorded: Mapping[str, UnitFound]) -> list[str]:
-    """What is otherwise of the units in one log: their places, and those that it lacks."""
+    """Lines `name: {…}` of units that differ in one log, by place or how they are read; `null`: the log lacks it."""
     masts, changes = iter(drive.guess.masts), {}
     for name in units:
         if name not in drive.units:

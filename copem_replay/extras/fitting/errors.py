@@ -274,7 +274,7 @@ def _choose_model(
 def _fit_spreads(
     rows: FitRows, *, simplest: bool
 ) -> tuple[dict[str, Estimate | None], dict[str, tuple[LastingPart, ...]], dict[str, str]]:
-    """By `yaw`, `speed` and `size` the spread, the parts that last, and why one of them is not fitted."""
+    """By `yaw` (°), `speed` (m/s), `size` (m): spread, lasting parts, why one lacks; `simplest`: nothing lasts."""
     spreads: dict[str, Estimate | None] = {}
     lasting: dict[str, tuple[LastingPart, ...]] = {}
     untold: dict[str, str] = {}

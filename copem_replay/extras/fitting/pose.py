@@ -160,19 +160,20 @@ def _fit_pose_memory(lags: Float, period_s: float, n: int) -> LastingPart | None
     B = lags.shape[2]
     delta_s = period_s * np.array(_LAGS)
 
-    def fitted(sums: Float) -> Float:
+    def fit_decay(sums: Float) -> Float:  # by lag the sum and number of products; (2,) share that lasts, ln of seconds
         mean = sums[:, 0] / np.maximum(sums[:, 1], 1)
         weight = np.sqrt(sums[1:, 1] / max(sums[0, 1], 1))
 
-        def off(x: Float) -> Float:
-            rest: Float = weight * (mean[1:] / mean[0] - np.clip(x[0], 0, 1) * np.exp(-delta_s / np.exp(x[1])))
-            return rest
+        def measure_residuals(x: Float) -> Float:
+            residual: Float = weight * (mean[1:] / mean[0] - np.clip(x[0], 0, 1) * np.exp(-delta_s / np.exp(x[1])))
+            return residual
 
-        found: Float = least_squares(off, [0.7, np.log(10 * period_s)], bounds=([0, -5], [1, 9])).x
-        return found
+        start = [0.7, np.log(10 * period_s)]
+        solution: Float = least_squares(measure_residuals, start, bounds=([0, -5], [1, 9])).x
+        return solution
 
-    best = fitted(lags.sum(axis=2))
-    left_out = np.array([fitted(lags.sum(axis=2) - lags[:, :, k]) for k in range(B)])
+    best = fit_decay(lags.sum(axis=2))
+    left_out = np.array([fit_decay(lags.sum(axis=2) - lags[:, :, k]) for k in range(B)])
     error = 1.96 * _jackknife(left_out)
     if best[0] - error[0] <= 0:
         return None

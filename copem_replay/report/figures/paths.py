@@ -93,7 +93,7 @@ def find_latest_log(results: Results) -> str:
 
 
 def average_unknown(results: Results, names: Sequence[str]) -> pd.DataFrame:
-    """A row per configuration and episode: mean `unknown_s` over runs, of never until its end; `never_share`."""
+    """A row per configuration and episode: mean `unknown_s` over runs (never: to the episode's end), `never_share`."""
     rows = results.known
     rows = rows[rows["configuration"].isin(list(names))]
     never = rows["time_to_detection_s"].isna()

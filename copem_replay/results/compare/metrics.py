@@ -454,20 +454,20 @@ def _held_gospa(pair: _Pair) -> SumStatistic | None:
 
 
 def _ghost_rates(pair: _Pair) -> SumStatistic | None:
-    """Ghosts per minute; those nearest to no measured object belong to their run only."""
+    """Sums for ghosts per minute of both sides: of each cell its object's, of each run all others; None: no lists."""
     first, second = pair.first.lists, pair.second.lists
     if first is None or second is None:
         return None
     present, runs = first["there"] & second["there"], pair.cells % pair.grid.runs
     cells, runs = pair.cells[present[runs]], runs[present[runs]]
-    nearest = np.zeros((len(cells), 4))
-    per_run = np.stack([side[name] for name in ("ghosts", "minutes") for side in (first, second)], axis=1).astype(float)
-    per_run[~present] = 0.0
+    cell_ghosts = np.zeros((len(cells), 4))
+    run_sums = np.stack([of[name] for name in ("ghosts", "minutes") for of in (first, second)], axis=1).astype(float)
+    run_sums[~present] = 0.0
     accuracy = [side.accuracy for side in pair.sides if side.accuracy is not None]
     for k, accuracy_of_side in enumerate(accuracy if len(accuracy) == 2 else ()):
-        nearest[:, k] = accuracy_of_side.ghosts[cells]
-        per_run[:, k] -= np.bincount(runs, nearest[:, k], minlength=len(per_run))
-    items = _append_run_items(pair, cells, nearest, per_run, present.astype(np.int64))
+        cell_ghosts[:, k] = accuracy_of_side.ghosts[cells]
+        run_sums[:, k] -= np.bincount(runs, cell_ghosts[:, k], minlength=len(run_sums))
+    items = _append_run_items(pair, cells, cell_ghosts, run_sums, present.astype(np.int64))
     return SumStatistic(parts=(items,), by_object=len(accuracy) == 2, of=_divide_rates)
 
 

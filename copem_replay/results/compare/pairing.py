@@ -71,7 +71,7 @@ class PairingGrid:
 
 
 def build_grid(log_ix: int, tables: Iterable[pa.Table], runs: int, before: int) -> PairingGrid:
-    """The grid of a log, from its rows of `detections.parquet` in several folders."""
+    """The grid of a log's episodes; `tables`: its `detections.parquet` by folder, `before`: objects of earlier logs."""
     episodes: dict[tuple[str, int], None] = {}
     for table in tables:
         pairs = (
