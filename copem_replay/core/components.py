@@ -66,9 +66,7 @@ UNKNOWN_KEY = "unknown_key"
 class Frozen(BaseModel):
     """Base of all models: immutable, and a key that is not known is refused."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=drop_python_examples, defer_build=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, json_schema_extra=drop_python_examples)
 
     @model_validator(mode="wrap")
     @classmethod
