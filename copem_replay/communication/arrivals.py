@@ -190,6 +190,13 @@ def _keep_newest(
     frames.pop()
     changed, list_of = np.ones(known.shape[1], np.bool_), np.full(known.shape[1], -1)
     for k in range(before + len(known)):
+        for j in range(n - 1, -1, -1):  # first, so that an older entry that arrives now takes the place
+            f = frame[current[active[j]]]
+            if issue_s[k] > lists.outdated_s[f]:
+                changed[lists.unit_ix[f]] = True
+                current[active[j]] = -1
+                active[j] = active[n - 1]
+                n -= 1
         for f in arrived[arrived_start[k] : arrived_start[k + 1]]:
             for e in range(lists.start[f], lists.start[f + 1]):
                 i = object_of[e]
@@ -201,13 +208,6 @@ def _keep_newest(
                     n += 1
                 elif lists.captured_s[f] >= lists.captured_s[frame[current[i]]]:
                     current[i] = e
-        for j in range(n - 1, -1, -1):
-            f = frame[current[active[j]]]
-            if issue_s[k] > lists.outdated_s[f]:
-                changed[lists.unit_ix[f]] = True
-                current[active[j]] = -1
-                active[j] = active[n - 1]
-                n -= 1
         if k < before:
             continue
         for u in units:

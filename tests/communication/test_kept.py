@@ -60,7 +60,19 @@ def test_of_each_object_the_newest_entry_that_is_not_too_old(seed: int) -> None:
             expected = sorted(e for e in known.values() if now_s <= arrives_s[frame[e]] + 0.4 + 1e-6)
             which = kept.newest[k, 0] - F
             found = kept.entry[kept.start[which] : kept.start[which + 1]].tolist() if which >= 0 else []
+            arriving = {same[e] for e in np.flatnonzero(unit_ix[frame] == 0) if abs(arrives_s[frame[e]] - now_s) < 1e-6}
+            assert arriving <= {same[e] for e in found}, "what is taken in now, is there now"
             older = {same[e] for e in expected}
             assert [e for e in found if same[e] in older] == expected
             # An older entry may take the place of a newer one that is too old by now: it came later.
             assert all(arrives_s[frame[e]] > arrives_s[frame[known[same[e]]]] for e in set(found) - set(expected))
+
+
+def test_an_older_message_that_comes_when_the_newer_one_is_too_old_has_its_entries_kept() -> None:
+    """No list comes in between: the newer entry is too old at the very instant at which the older one arrives."""
+    received = lists(np.array([0, 0]), np.array([0.8, 1.0]), np.array([1.43, 1.2]))
+    schedule = fusion_schedule(received, max_age_s=0.2)
+    sent = SentEntries(np.array([0, 1, 2]), np.array([7, 7]))
+    kept = keep_entries(received, sent, np.array([True, False]), schedule, schedule, max_age_s=0.2)
+    which = kept.newest[:, 0] - 2
+    assert [kept.entry[kept.start[k] : kept.start[k + 1]].tolist() for k in which] == [[1], [0]]
