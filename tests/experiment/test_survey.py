@@ -110,6 +110,9 @@ def test_survey(path):
                         "delay": "cannot be told: nothing in them can be followed from list to list",
                         "oddities": [],
                         "middle_m": [0.0, 0.0],
+                        "at_wgs84": None,
+                        "views": [],
+                        "no_views": "",
                     }
                 ],
                 "map": None,

@@ -322,7 +322,7 @@ def test_the_command_and_its_exit_codes(call: Call, here: Path) -> None:
     done = call("require", "e.yaml", "--criterion", "soon", *words)
     lines = done.out.splitlines()
     assert done.code == 0
-    assert lines[:2] == ["soon: ttd_rmst_s ≤ 0.4, coPEM", f"{LATENCY}: 0 to 1.5 by 0.1"]
+    assert lines[:2] == ["soon: known after (mean) ≤ 0.4 s, coPEM", f"{LATENCY}: 0 to 1.5 by 0.1"]
     assert "require.csv, require.png, required.yaml in out/e_require" in lines
     assert lines[-1].startswith("required.yaml has latency_s 0.")
     assert call("run", "out/e_require/required.yaml").code == 1  # `never` does not pass
