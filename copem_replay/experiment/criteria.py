@@ -184,7 +184,7 @@ def note_undecidable(criteria: Mapping[str, Criterion], counted: Sequence[int], 
 
 
 def _note_too_few(name: str, criterion: Criterion, known: Known, horizon_s: float) -> str | None:
-    """A note on a criterion that so few cannot show to be met, as good as they may be; None: they can."""
+    """A note on a criterion that so few clusters cannot show to be met, however good the figure; None: they can."""
     if criterion.against is not None:
         return None
     metric, bound = criterion.metric, criterion.bound

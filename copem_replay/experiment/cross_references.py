@@ -99,27 +99,27 @@ _NAMED: Final[tuple[tuple[tuple[str, ...], str, tuple[str, ...], tuple[str, ...]
 
 
 def _check_names(data: Mapping[str, Any], names: Names) -> Problems:
-    """Undefined names, and units that are named twice."""
+    """Key and message of each undefined name, and of each unit that is named twice."""
     for path, noun, before, after in _NAMED:
-        known = [*before, *names[_SECTIONS[noun]], *after]
-        right = {*known, TRUTH} if after == _BY_UNIT else {*known}
+        known_names = [*before, *names[_SECTIONS[noun]], *after]
+        valid_names = {*known_names, TRUTH} if after == _BY_UNIT else {*known_names}
         for key, name in find_values(data, *path):
-            if _is_name(name) and str(name) not in right:
-                yield key, unknown_name_message(noun, name, known)
+            if _is_name(name) and str(name) not in valid_names:
+                yield key, unknown_name_message(noun, name, known_names)
     modelled, defined = {*_list_modelled_units(data)}, {*names["units"]}
     for section in ("units", "inputs"):
         for key, listed in find_values(data, "configurations", EACH, section):
-            unseen = {*defined}
+            unlisted_units = {*defined}
             for k, unit in enumerate(_list_texts(listed) or ()):
                 if section == "inputs" and unit in modelled:
                     yield (*key, k), f"unit {unit!r} has a PEM; the inputs of a stack are `recorded` units"
-                elif unit in defined and unit not in unseen:
+                elif unit in defined and unit not in unlisted_units:
                     yield (*key, k), f"unit {unit!r} named twice"
-                unseen.discard(unit)
+                unlisted_units.discard(unit)
 
 
 def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
-    """Undefined links, units that do not send by them, and fusions of what they cannot fuse."""
+    """Problems of configurations: undefined links, units that do not send by them, fusions of what they cannot fuse."""
     modelled = _list_modelled_units(data)
     for name, configuration in _items(data, "configurations"):
         key, members, listed = ("configurations", name), (of := configuration.get("units")), _list_texts(of)
@@ -134,17 +134,17 @@ def _check_configurations(data: Mapping[str, Any], names: Names) -> Problems:
             yield how, f"posterior draws errors, and what unit {one!r} lists has errors already; use samples"
         if (kind := _fusion_kind(configuration)) is not None and members == TRUTH:
             yield (*key, "fusion"), f"the truth is not fused; {kind} needs units"
-        everyone = [TRUTH] if members == TRUTH else [*names["units"], TRUTH]
-        received = unit_names if members == "all" or listed is not None else everyone
+        all_senders = [TRUTH] if members == TRUTH else [*names["units"], TRUTH]
+        received = unit_names if members == "all" or listed is not None else all_senders
         yield from _check_link((*key, "link"), configuration.get("link"), received, names)
 
 
 def _check_members(data: Mapping[str, Any], _: Names) -> Problems:
-    """Units that cannot be fused by another one, and configurations that would hear one twice."""
+    """Problems of units that cannot be fused by another one, and of configurations that would hear one twice."""
     units, fused_by = dict(_items(data, "units")), dict[str, str]()
     fusing = {name: _list_texts(unit.get("fuses")) or [] for name, unit in units.items()}
     for name, members in fusing.items():
-        places = {str(units[one].get("on")) for one in members if one in units and units[one].get("recorded") is None}
+        carriers = {str(units[one].get("on")) for one in members if one in units and units[one].get("recorded") is None}
         for k, one in enumerate(members):
             key: Key = ("units", name, "fuses", k)
             member = units.get(one, {})
@@ -154,7 +154,7 @@ def _check_members(data: Mapping[str, Any], _: Names) -> Problems:
                 yield key, f"unit {one!r} is fused by {fused_by[one]!r} already; a list counts once"
             elif member.get("fuses") is not None:
                 yield key, f"unit {one!r} fuses others itself; chains are one level deep: name its members"
-            elif isinstance(member.get("on"), dict) or len(places) > 1:
+            elif isinstance(member.get("on"), dict) or len(carriers) > 1:
                 what = "is carried by several objects" if isinstance(member.get("on"), dict) else "moves apart from it"
                 yield key, f"unit {one!r} {what}; expected members on one object, or all at places"
             if _list_said(data, name, "placed") and _list_said(data, one, "recorded"):
@@ -171,7 +171,7 @@ def _check_members(data: Mapping[str, Any], _: Names) -> Problems:
 
 
 def _check_link(key: Key, link: object, received: Sequence[str], names: Names) -> Problems:
-    """Undefined links, and units that send by links and are undefined or not among those `received`."""
+    """Problems of a `link`: undefined ones, and units that are undefined or not among those `received`."""
     by_unit = isinstance(link, Mapping) and "kind" not in link
     for unit, name in link.items() if isinstance(link, Mapping) and by_unit else [(None, link)]:
         at, known = (*key, str(unit)) if by_unit else key, [*names["units"], *_BY_UNIT]
@@ -185,7 +185,7 @@ def _check_link(key: Key, link: object, received: Sequence[str], names: Names) -
 
 
 def _check_places(data: Mapping[str, Any], names: Names) -> Problems:
-    """Units that distances are measured from and that have no place, and keys of logs that are swept."""
+    """Problems of `distance_to` a unit without a place, and of keys of logs that are swept."""
     key = ("measure", "distance_to")
     place = find_value(data, *key, default="ego")
     measured = {} if place == "ego" else _mapping(data, "units", str(place))
@@ -195,9 +195,9 @@ def _check_places(data: Mapping[str, Any], names: Names) -> Problems:
         yield key, f"unit {place!r} fuses others and has no place of its own; name one of its members"
     if isinstance(measured.get("on"), dict):
         yield key, f"unit {place!r} is carried by several objects; name a single one"
-    for entry, own in find_values(data, "logs", ITEMS, "units", EACH):
-        asked = find_value(data["logs"][entry[1]], *key, default=place)
-        if own is None and entry[-1] == asked and asked in names["units"]:
+    for entry, own_unit in find_values(data, "logs", ITEMS, "units", EACH):
+        distance_unit = find_value(data["logs"][entry[1]], *key, default=place)
+        if own_unit is None and entry[-1] == distance_unit and distance_unit in names["units"]:
             message = f"the log lacks unit {entry[-1]!r}, from which distances are measured; give the log its own"
             yield entry, f"{message} `measure: {{distance_to: …}}`"
     for what, quantity in (("rate_hz", "rate_hz"), ("on", "penetration_rate")):
@@ -207,9 +207,9 @@ def _check_places(data: Mapping[str, Any], names: Names) -> Problems:
 
 
 def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
-    """What has no exact times, and keys that exclude the messages of units."""
+    """Problems of `measure.exact`: what has no exact times; and of messages with confirmation by several hits."""
     hits, window = (find_value(data, "measure", "confirm", what, default=1) for what in ("hits", "of"))
-    several, units = isinstance(hits, int) and hits > 1, list(_items(data, "units"))
+    several_hits, units = isinstance(hits, int) and hits > 1, list(_items(data, "units"))
     why = list[str]()
     for name, configuration in _items(data, "configurations"):
         if configuration.get("recorded") is not None:
@@ -227,12 +227,12 @@ def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
         why.append("perceived conflicts depend on sampled errors and have no closed form; use `brakes_for: object`")
     for name, unit in units:
         sends = _mapping(unit, "sends")
-        if several and (sends.get("kind") == "cpm" or sends.get("max_objects") is not None):
+        if several_hits and (sends.get("kind") == "cpm" or sends.get("max_objects") is not None):
             what = "leave out objects that are still there, so a miss is no missed capture; confirm with one hit"
             yield ("measure", "confirm"), f"the messages of unit {name!r} {what}"
         if unit.get("sends") is not None:
             why.append(f"unit {name!r} has `sends` rules that depend on earlier messages, which has no closed form")
-        if several and isinstance(unit.get("on"), dict):
+        if several_hits and isinstance(unit.get("on"), dict):
             what = "is only in some runs, and confirmation by several hits then has no closed form"
             why.append(f"unit {name!r} {what}; confirm with one hit")
     if find_value(data, "measure", "exact") is not True:
@@ -244,7 +244,7 @@ def _check_exact(data: Mapping[str, Any], _: Names) -> Problems:
 
 
 def _check_keys(data: Mapping[str, Any], _: Names) -> Problems:
-    """Keys that need others, and numbers that exceed others."""
+    """Problems of keys that need others, and of numbers that exceed others."""
     kind = find_value(data, "measure", "onset", "kind")
     if isinstance(kind, str) and onset_requirement(kind) is Requires.UNIT and not _list_modelled_units(data):
         yield ("measure", "onset"), f"{kind}: there is no unit to see anything"
@@ -267,7 +267,7 @@ def _check_keys(data: Mapping[str, Any], _: Names) -> Problems:
 
 
 def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
-    """Quantities that nothing in the experiment has, and values that it cannot have."""
+    """Problems of swept quantities that nothing in the experiment has, and of values that it cannot have."""
     sweep = _mapping(data, "sweep")
     for quantity, exists, message in (
         ("penetration_rate", any(isinstance(unit.get("on"), dict) for _, unit in _items(data, "units")),
@@ -292,7 +292,7 @@ def _check_sweep(data: Mapping[str, Any], names: Names) -> Problems:
 
 
 def _check_swept_links(data: Mapping[str, Any], kind: str, configurations: Sequence[str]) -> Problems:
-    """Problems of swept links: their loss cannot be varied, or not to a value; or no link has the swept quantity."""
+    """Problems of a sweep of `kind` (`loss`, `burst_s`): a link cannot have the value, or no link has the quantity."""
     varies, link_names = False, set[str]()
     for name, configuration in _items(data, "configurations"):
         link = configuration.get("link")
@@ -416,7 +416,7 @@ def _unknown_configuration(name: object, known: Sequence[str]) -> str:
 
 
 def _find_metric_problem(metric: str, paired: bool, study: Mapping[str, Any]) -> str | None:
-    """Why a metric cannot be held against a bound; None: it can. `paired`: it is a difference."""
+    """Why a metric cannot be held against a bound; None: it can. `paired`: it is a difference; `study`: plain data."""
     own_names = [str(name) for _, name in find_values(study, "measure", "metrics", ITEMS, "name")]
     part_of = {name.name: part for part, names in METRICS_OF.items() for name in names}
     if metric not in part_of and metric not in own_names and metric not in COMPARED:

@@ -23,7 +23,7 @@ def uses_degrees(experiment: Experiment) -> bool:
 
 
 def _list_degrees(experiment: Experiment) -> Iterator[tuple[Key, Any]]:
-    """Keys and places of everything in degrees."""
+    """The key of everything that is given in degrees, and its places (latitude, longitude)."""
     for name, unit in experiment.units.items():
         if unit.at_wgs84 is not None:
             yield ("units", name, "at_wgs84"), [unit.at_wgs84[:2]]

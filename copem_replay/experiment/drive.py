@@ -92,6 +92,7 @@ def apply_settings(experiment: Experiment, settings: LogSettings) -> Experiment:
 
 
 def _apply_units(experiment: Experiment, settings: LogSettings) -> dict[str, Unit]:
+    """The units that a log has, with its own keys; a unit that fuses fuses those members. Raises SettingsError."""
     units: dict[str, Unit] = {}
     for name, unit in experiment.units.items():
         changes = settings.units.get(name, {})
@@ -106,9 +107,9 @@ def _apply_units(experiment: Experiment, settings: LogSettings) -> dict[str, Uni
                 raise SettingsError(("units", name), data, error) from error
     for name, unit in list(units.items()):  # a unit fuses those of its members that the log has
         if unit.fuses is not None and not units.keys() >= set(unit.fuses):
-            there = tuple(member for member in unit.fuses if member in units)
+            members_here = tuple(member for member in unit.fuses if member in units)
             units.pop(name)
-            units |= {name: unit.model_copy(update={"fuses": there})} if there else {}
+            units |= {name: unit.model_copy(update={"fuses": members_here})} if members_here else {}
     return units
 
 
@@ -122,7 +123,7 @@ def _replace_keys(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[s
 
 
 def _apply_measure(measure: Measure, changes: Mapping[str, Any]) -> Measure:
-    """`measure` of a log: `objects` is changed key by key, the other keys as a whole. Raises SettingsError."""
+    """`measure` of a log: `objects` is changed key by key, other keys are replaced. Raises SettingsError."""
     data: dict[str, Any] = {key: getattr(measure, key) for key in measure.model_fields_set} | dict(changes)
     objects = changes.get("objects")
     try:
@@ -137,7 +138,7 @@ def _apply_measure(measure: Measure, changes: Mapping[str, Any]) -> Measure:
 
 
 def _keep_configurations(experiment: Experiment, units: Mapping[str, Unit]) -> dict[str, Configuration]:
-    """The configurations, with the units that the log has, except those that lose all their units."""
+    """The configurations reduced to the units that the log has; those that lose all their units are left out."""
     remaining: dict[str, Configuration] = {}
     for name, configuration in experiment.configurations.items():
         members = experiment.units_of(configuration)
@@ -200,6 +201,7 @@ class RecordedLatency(LatencyModel):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
+        """Read the delays (s) from the file, when the keys are parsed. Raises an error at the key `file`."""
         if (self.column is None) == (self.topic is None):
             raise ValueError("expected one of `column: <name>` (of a CSV) and `topic: <name>` (of an MCAP)")
         where = f"{Path(self.file).name}: {f'column {self.column}' if self.column else f'topic {self.topic}'}"
@@ -230,7 +232,7 @@ class RecordedLatency(LatencyModel):
         return result
 
     def _of_topic(self, topic: str) -> Float:
-        """Log time − stamp of all messages of a topic, in seconds. Raises KeyError where there are none."""
+        """Log time − stamp (s) of all messages of a topic. Raises KeyError: no such topic, or no stamps."""
         log = open_log(Path(self.file))
         channel = next((c for c in log.channels if c.topic == topic), None)
         if channel is None:

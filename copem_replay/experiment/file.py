@@ -54,7 +54,7 @@ def describe_by_key(error: ValidationError, data: dict[str, Any], prefix: Key = 
 
 
 def _file_key(data: Any, item: Any) -> Key:
-    """The location that pydantic gives, without parts that are not in the file (names of alternatives, `[key]`)."""
+    """The key in the file of a problem that pydantic reports: its location without names of alternatives."""
     key: list[str | int] = []
     value, location = data, item["loc"]
     for k, part in enumerate(location):
@@ -102,6 +102,7 @@ def find_meant_key(key: Key, known: Sequence[str]) -> list[str]:
 
 
 def _problem_message(items: Sequence[Any], key: Key) -> str:
+    """One line on the problems at a key: unknown (with a hint), missing, or what was expected and found."""
     first = items[0]
     if first["type"] == UNKNOWN_KEY:
         known = first["ctx"]["known"]
@@ -116,8 +117,8 @@ def _problem_message(items: Sequence[Any], key: Key) -> str:
         return "unknown key" + (f"; {hint}" if known else "")
     if first["type"] == "missing":
         return "missing"
-    if own := [item for item in items if item["type"] not in _EXPECTED]:
-        return str(own[0]["msg"]).removeprefix("Value error, ")
+    if own_messages := [item for item in items if item["type"] not in _EXPECTED]:
+        return str(own_messages[0]["msg"]).removeprefix("Value error, ")
     if first["type"] == "too_short" and isinstance(first["input"], Mapping):
         return "expected at least one, found none"
     words = dict.fromkeys(_EXPECTED[item["type"]].format(**item.get("ctx", {})) for item in items)
@@ -363,18 +364,18 @@ def _find_places(source: ExperimentSource, k: int, pattern: str | None) -> list[
 
 
 def _part_of(file: File, entries: Sequence[object], k: int) -> Place:
-    """The place of an entry of `logs`: the file, or a log of its own by name and window where others name it, too."""
-    whole = [entry.model_dump() if isinstance(entry, LogSettings) else entry for entry in entries]
-    named = [entry.get("file") if isinstance(entry, dict) else entry for entry in whole]
-    entry = whole[k]
-    if isinstance(file, RemoteFile) or named.count(named[k]) < 2 or not isinstance(entry, dict):
+    """The place of entry k of `logs`: its file, or one log of it where several entries name the file."""
+    plain_entries = [entry.model_dump() if isinstance(entry, LogSettings) else entry for entry in entries]
+    file_names = [entry.get("file") if isinstance(entry, dict) else entry for entry in plain_entries]
+    entry = plain_entries[k]
+    if isinstance(file, RemoteFile) or file_names.count(file_names[k]) < 2 or not isinstance(entry, dict):
         return file
     name, window_s = entry.get("name"), entry.get("window_s")
-    ends = [
+    window_ends = [
         float(end) if isinstance(end, int | float) else end
         for end in (window_s if isinstance(window_s, list | tuple) else ())
     ]
-    return DriveRecordings((file,), (0.0,), f"{name} {ends}") if name or ends else file
+    return DriveRecordings((file,), (0.0,), f"{name} {window_ends}") if name or window_ends else file
 
 
 def _explain_unasked(source: ExperimentSource, k: int, pattern: str | None) -> str | None:
@@ -396,7 +397,7 @@ def combine_recordings(names: Sequence[str], offset_s: Mapping[str, object], fol
 
 
 def _list_patterns(source: ExperimentSource) -> dict[int, tuple[Key, str | None, bool]]:
-    """By number the key of each entry of `logs`, its pattern (None: several recordings), and whether it has a name."""
+    """By number of an entry of `logs`: its key, its pattern (None: several recordings), whether it has a name."""
     entries = source.data.get("logs")
     result: dict[int, tuple[Key, str | None, bool]] = {}
     for k, entry in enumerate(entries if isinstance(entries, list | tuple) else []):

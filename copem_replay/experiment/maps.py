@@ -103,7 +103,7 @@ class MapFile(Frozen):
         return _read_map_once(self.file, self._sha256, tuple(self.heights_m.model_dump().items()))
 
     def place(self, frame: Frame | None) -> SiteMap:
-        """The map in metres of a log with this frame. Raises InputError: its place is not known."""
+        """The map in metres of a log with this frame (None: it has none). Raises InputError: its place is unknown."""
         site, offset_m = self.read_once(), np.array(self.offset_m)
         if self.frame == "same":
             return site.moved(lambda at_m: at_m + offset_m)
@@ -216,10 +216,10 @@ def _choose_solids(
     usable = np.flatnonzero(shapely.is_valid(outlines) & (shapely.area(outlines) > 0.0))
     distance_m = np.full(len(usable), np.inf)
     if len(at_m) and len(usable):
-        (which, _), nearest_m = shapely.STRtree(shapely.points(at_m.real, at_m.imag)).query_nearest(
+        (solid_number, _), nearest_m = shapely.STRtree(shapely.points(at_m.real, at_m.imag)).query_nearest(
             outlines[usable], return_distance=True, all_matches=False
         )
-        distance_m[which] = nearest_m
+        distance_m[solid_number] = nearest_m
     chosen = usable[distance_m <= within_m]
     counts["whose outline crosses itself: left out"] += len(solids) - len(usable)
     counts[f"beyond {within_m:g} m of every object: left out"] += len(usable) - len(chosen)

@@ -273,6 +273,7 @@ class Unit(Placement):
 
     @model_validator(mode="after")
     def _place(self) -> Self:
+        """Check, once keys are parsed, that a unit has one source of lists and one place. Raises ValueError."""
         if sum(what is not None for what in (self.pem, self.recorded, self.fuses)) != 1:
             raise ValueError("expected one of `pem: <name>`, `recorded: {topic: …}` and `fuses: [<unit>, …]`")
         places = (self.on, self.at, self.at_wgs84)
@@ -406,6 +407,7 @@ class LogSettings(Frozen):
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
+        """Check, once keys are parsed, that an entry names its recordings once. Raises ValueError."""
         if (self.file is None) == (self.together is None):
             raise ValueError("expected one of `file: <recording>` and `together: [<recording>, <recording>]`")
         paths = self.together or ()

@@ -143,15 +143,15 @@ def _check_units_in_solids(experiment: Experiment, recording: Recording) -> Iter
 
 
 def _check_velocities(experiment: Experiment, recording: Recording) -> Iterator[tuple[Key, str]]:
-    """Lists without velocities cannot say whether the driver must brake, unless their fusion remembers places."""
-    needing = {
+    """The key and line of a problem: lists without velocities, of which a fusion cannot say whether to brake."""
+    needing_units = {
         unit
         for name, configuration in experiment.configurations.items()
         if not getattr(configuration.fusion, "remembers", False)
         for unit in (*experiment.units_of(configuration), output_unit(name))
     }
     silent = [name for name, of in recording.lists.items() if not of.velocity_said and len(of.tracks.frame_ix)]
-    if experiment.needless is not None and (named := [name for name in silent if name in needing]):
+    if experiment.needless is not None and (named := [name for name in silent if name in needing_units]):
         yield (
             ("braking", "needless"),
             f"the lists of {', '.join(named)} state no velocity, so all would stand in the way; expected a fusion that "
@@ -360,28 +360,29 @@ def _name_paths(source: ExperimentSource) -> dict[str, list[str]]:
 
 
 def _read_recording(experiment: Experiment, place: Place) -> tuple[Recording | None, list[RefusedLog]]:
-    """A recording, None where it cannot be read, and its refusals. A remote file is copied while it is read."""
+    """A recording (None: unreadable), and its refusals. A remote file is copied while it is read."""
     if not isinstance(place, RemoteFile):
         return _read_local_recording(experiment, place)
     if (place.there or {}).get("type") == "directory":
         return None, [
             RefusedLog(place, "expected a file, found a folder; a rosbag2 folder is read on this machine only")
         ]
-    now = RemoteFile(place.url)  # its stamp, asked for just before the copy, identifies the content
+    current_file = RemoteFile(place.url)  # its stamp, asked for just before the copy, identifies the content
     try:
-        stamp = now.stamp
+        stamp = current_file.stamp
         with fetch_place(place) as local:
-            recording, wrong = _read_local_recording(experiment, local)
+            recording, refusals = _read_local_recording(experiment, local)
             if recording is not None:
-                recording = replace(recording, remote=now, sha256=sha256_of(local), stamps=None)
+                recording = replace(recording, remote=current_file, sha256=sha256_of(local), stamps=None)
         if RemoteFile(place.url).stamp != stamp:
             return None, [RefusedLog(place, "it changed while it was copied; run the command again")]
     except InputError as error:
         return None, [RefusedLog(place, line.removeprefix(f"{place}: ")) for line in error.problems]
-    return recording, [replace(one, path=place, reason=one.reason.replace(str(local), str(place))) for one in wrong]
+    return recording, [replace(one, path=place, reason=one.reason.replace(str(local), str(place))) for one in refusals]
 
 
 def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recording | None, list[RefusedLog]]:
+    """A recording (None: unreadable) with its lists, frame and maps, and all refusals by the experiment."""
     path = place if isinstance(place, Path) else place.paths[0]
     if experiment.read.definitions is not None:
         place = DriveRecordings((place,), (0.0,)) if isinstance(place, Path) else place
@@ -393,9 +394,9 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
     ego = None if experiment.ego in (None, NO_EGO) else experiment.ego
     wrong: list[RefusedLog] = []
     fields = experiment.read if isinstance(experiment.read, TruthFields) else None
-    beside = {recorded.topic for recorded in (*experiment.recorded.values(), *experiment.outputs.values())}
+    unit_topics = {recorded.topic for recorded in (*experiment.recorded.values(), *experiment.outputs.values())}
     read = partial(
-        read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, unit_topics=beside,
+        read_log, place, name=name_log(path), topic=experiment.read.topic, fields=fields, unit_topics=unit_topics,
         window_s=experiment.window_s, max_gap_s=experiment.max_gap_s, classes=experiment.read.classes,
     )  # fmt: skip
     try:
@@ -407,9 +408,9 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line, error.key or None) for line in error.within(path)]
     if experiment.ego == NO_EGO:
         recording = replace(recording, scene=replace(recording.scene, ego_ix=-1))
-    frame, why, of_frame = None, "", list[str]()
+    frame, no_frame_why, of_frame = None, "", list[str]()
     try:
-        frame, why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
+        frame, no_frame_why, of_frame = find_frame(experiment.frame, experiment.maps, recording)
         recording = replace(recording, scene=replace(recording.scene, frame=frame))
     except InputError as error:
         wrong += [RefusedLog(path, line, ("frame",)) for line in error.problems]
@@ -438,11 +439,11 @@ def _read_local_recording(experiment: Experiment, place: Local) -> tuple[Recordi
         return None, [RefusedLog(path, line) for line in error.within(path)]
     scene = replace(recording.scene, tags={**recording.scene.tags, **experiment.tags})
     recording = replace(recording, scene=scene, lists=lists, notes=(*notes, *of_frame))
-    degree_problems = [] if wrong else [*check_degrees(experiment, frame, why, find_middle(recording))]
+    degree_problems = [] if wrong else [*check_degrees(experiment, frame, no_frame_why, find_middle(recording))]
     experiment = resolve_degrees(experiment, frame)
     recording, disagreeing = add_maps(recording, experiment.maps, frame)
-    standing = {name: unit.at for name, unit in experiment.units.items() if unit.at is not None}
-    far_notes = list_far_units(recording, experiment.maps, standing) if standing and experiment.maps else ()
+    standing_units = {name: unit.at for name, unit in experiment.units.items() if unit.at is not None}
+    far_notes = list_far_units(recording, experiment.maps, standing_units) if standing_units and experiment.maps else ()
     recording = take_lanes(experiment, replace(recording, notes=(*recording.notes, *far_notes)))
     wrong += [RefusedLog(path, line, key) for key, line in (*degree_problems, *disagreeing)]
     return recording, wrong + [
@@ -461,7 +462,7 @@ def take_lanes(experiment: Experiment, recording: Recording) -> Recording:
 
 
 def _check_slices(experiment: Experiment, scenes: Sequence[Scene], at: Callable[[Key, str], str]) -> Iterator[str]:
-    """Tags that the summary is sliced by, or that a PEM asks for, and no log has; areas that there are none of."""
+    """Lines on tags that `measure.by` or a PEM names and no log has, and on areas where no log has any."""
     known = {name for scene in scenes for name in scene.tags}
     tags_named: list[tuple[Key, str]] = [
         (("measure", "by", k), name) for k, by in enumerate(parse_slices(experiment.measure.by)) for name in by.tags

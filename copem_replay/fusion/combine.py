@@ -72,7 +72,7 @@ def _covers(a: float, b: float, d: float) -> bool:
 
 @callee
 def _find_least_trace(along: float, cross: float, across: float, distance: float) -> tuple[float, float]:
-    """The place of least trace from the middle: towards b (by golden sections), and to the left of that way."""
+    """The place (u, v) of least trace from the middle: u towards b (by golden sections), v to the left of that way."""
     if distance == 0:
         return 0.0, 0.0
     low, high = -distance / 2, distance / 2
@@ -94,9 +94,8 @@ def _find_least_trace(along: float, cross: float, across: float, distance: float
 
 @callee
 def _minimise_across(u: float, along: float, cross: float, across: float, distance: float) -> tuple[float, float]:
-    """The best v for this u, by halvings, and u² + v² + ‖V − U‖₁/2 there.
-
-    The norm of (m, q; q, n) is the larger of |m + n| and the root of (m − n)² + 4q².
+    """The best v for this u, by halvings, and there the criterion u² + v² + ‖V − U‖₁/2. The norm of (m, q; q, n) is the
+    larger of |m + n| and the root of (m − n)² + 4q².
     """
     m = along - 2 * u * distance
     trace, difference = abs(m + across), m - across
@@ -116,7 +115,7 @@ def _minimise_across(u: float, along: float, cross: float, across: float, distan
 
 @callee
 def _positive_part(a: float, b: float, d: float) -> tuple[float, float, float]:
-    """(a, b; b, d) with its negative eigenvalues replaced by 0, as (a, b, d)."""
+    """The matrix (a, b; b, d) with its negative eigenvalues replaced by 0, as (a, b, d)."""
     middle, half = (a + d) / 2, math.hypot((a - d) / 2, b)
     if middle >= half:
         return a, b, d
@@ -176,25 +175,25 @@ def unite_conflicting(
 
 @callee
 def _find_host_clusters(clusters: EntryClusters, fused: Entries, agree: Bool) -> Int:
-    """(clusters,) the cluster that each becomes part of; its own index: none."""
-    host, kind = np.arange(len(fused)), np.empty(len(fused), np.int64)
+    """(clusters,) the cluster of the same instant that each becomes part of, as boxes overlap; its own index: none."""
+    host, class_ix = np.arange(len(fused)), np.empty(len(fused), np.int64)
     for c in range(len(fused)):
-        kind[c] = most_probable_class(fused[c].class_probability)
+        class_ix[c] = most_probable_class(fused[c].class_probability)
     for k in range(len(clusters.start) - 1):
         first = clusters.start[k]
         for c in range(first, clusters.start[k + 1]):
-            most, a = 0.0, fused[c]
+            best_overlap, a = 0.0, fused[c]
             for other in range(first, c):
                 b = fused[other]
                 reach = np.hypot(a.length_m, a.width_m) / 2 + np.hypot(b.length_m, b.width_m) / 2
-                apart = (a.x_m - b.x_m) ** 2 + (a.y_m - b.y_m) ** 2
-                if host[other] != other or apart > reach * reach or not agree[kind[c], kind[other]]:
+                distance2 = (a.x_m - b.x_m) ** 2 + (a.y_m - b.y_m) ** 2
+                if host[other] != other or distance2 > reach * reach or not agree[class_ix[c], class_ix[other]]:
                     continue
                 overlap = rotated_iou(
                     a.x_m, a.y_m, a.yaw_rad, a.length_m, a.width_m, b.x_m, b.y_m, b.yaw_rad, b.length_m, b.width_m
                 )
-                if overlap > most and not _share_a_list(clusters, host, c, other, first):
-                    most = overlap
+                if overlap > best_overlap and not _share_a_list(clusters, host, c, other, first):
+                    best_overlap = overlap
                     host[c] = other
     return host
 
@@ -214,7 +213,7 @@ def _share_a_list(clusters: EntryClusters, host: Int, c: int, into: int, first: 
 
 @callee
 def _take_in_member(state: Any, point: Any, gate: float) -> None:
-    """Takes a member into the state so far, in place: by inverse variance within the gate, else by union."""
+    """Joins a member to `state`, in place: by inverse variance within the gate, else by covariance union."""
     ee, en, nn = state.ee + point.ee, state.en + point.en, state.nn + point.nn
     dx, dy = point.x_m - state.x_m, point.y_m - state.y_m
     if nn * dx * dx - 2 * en * dx * dy + ee * dy * dy <= gate * (ee * nn - en * en):
@@ -341,7 +340,7 @@ def inverse_covariance_intersection(x: Float, cov: Float, by_determinant: bool) 
 
 @callee
 def _combine_pair(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, G: Float, P: Float) -> None:
-    """Writes G = (ωA + (1 − ω)B)⁻¹ and P."""
+    """Fills G = (ωA + (1 − ω)B)⁻¹ and P = (A⁻¹ + B⁻¹ − G)⁻¹: inverse covariance intersection at weight ω."""
     d = len(A)
     for i in range(d):
         for j in range(d):
@@ -356,9 +355,8 @@ def _combine_pair(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b:
 
 @callee
 def _omega_slope(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, by_determinant: bool) -> float:
-    """Derivative of the criterion by ω over its value (of the determinant: of its logarithm).
-
-    −⟨P, P G (A − B) G⟩ over tr P, or −tr(P G (A − B) G).
+    """Derivative of the criterion by ω over its value (of the determinant: of its logarithm). −⟨P, P G (A − B) G⟩ over
+    tr P, or −tr(P G (A − B) G).
     """
     d = len(A)
     G, P = np.empty((d, d)), np.empty((d, d))
@@ -388,15 +386,15 @@ def _omega_slope(omega: float, A: Float, B: Float, inverse_a: Float, inverse_b: 
 def _find_omega(
     low: float, high: float, A: Float, B: Float, inverse_a: Float, inverse_b: Float, by_determinant: bool
 ) -> float:
-    """ω where the slope, `low` < 0 at 0 and `high` > 0 at 1, is 0: false position, with halvings where it stalls."""
-    left, right, omega, before = 0.0, 1.0, 0.5, 2.0
+    """The ω in (0, 1) of slope 0, from slopes `low` < 0 at 0 and `high` > 0 at 1: false position, with halvings."""
+    left, right, omega, last_omega = 0.0, 1.0, 0.5, 2.0
     for count in range(_INTERSECTION_ROUNDS):
         width = right - left
         omega = left - low * width / (high - low) if count % 3 < 2 else (left + right) / 2
         slope = _omega_slope(omega, A, B, inverse_a, inverse_b, by_determinant)
-        if abs(omega - before) <= 1e-13 or slope == 0:
+        if abs(omega - last_omega) <= 1e-13 or slope == 0:
             break
-        before = omega
+        last_omega = omega
         if slope < 0:
             left, low = omega, slope
         else:
@@ -435,7 +433,7 @@ def combine_members(clusters: EntryClusters, method: int, setting: float, by_det
 
 @callee
 def _combine_split(x: Float, cov: Float, method: int, setting: float, by_determinant: bool) -> tuple[Float, Float]:
-    """Split covariance intersection; without independent parts the plain one, where equal inputs share their weight."""
+    """Mean and covariance by split covariance intersection; by the plain one where no part is independent."""
     if method == SPLIT_BY_SHARE:
         dependent, independent = split_by_share(cov, setting)
     else:

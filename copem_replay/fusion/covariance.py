@@ -108,7 +108,7 @@ def fast_covariance_intersection(x: Float, cov: Float, keep_best: bool) -> tuple
 
 @callee
 def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -> tuple[Float, Float]:
-    """Mean and covariance where input i counts `weight` times."""
+    """Mean (d,) and covariance (d, d) where input i counts `weight[i]` times; a single input stays as it is."""
     n, d = x.shape
     single = -1
     for k in range(n):
@@ -158,7 +158,7 @@ def _combine_weighted(x: Float, cov: Float, information: Float, weight: Float) -
 
 @callee
 def _best_weights(information: Float, by_determinant: bool) -> Float:
-    """Weights (n,) that minimise the determinant or the trace of (Σ wᵢIᵢ)⁻¹."""
+    """Weights (n,), sum 1, that minimise the determinant or the trace of (Σ wᵢIᵢ)⁻¹, by Newton's method."""
     n, d = information.shape[:2]
     weight = np.full(n, 1.0 / n)
     if n == 1:
@@ -168,7 +168,7 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
     B, lever, score = np.eye(d) / np.sqrt(d), np.empty((n, d, d)), np.empty(n)
     for _ in range(40 + 4 * n):
         _whiten(info, weight, B, by_determinant)
-        off, enters = 0.0, -1
+        largest_error, entering = 0.0, -1
         for k in range(n):
             score[k] = 0.0
             for i in range(d):
@@ -178,29 +178,29 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
                         lever[k, i, j] += info[k, i, m] * B[m, j]
                     score[k] += lever[k, i, j] * B[i, j]
             if weighted[k]:
-                off = max(off, abs(score[k] - 1))
-            elif enters < 0 or score[k] > score[enters]:
-                enters = k
-        if off <= _GAP:
-            if enters < 0 or score[enters] <= 1 + _GAP:
+                largest_error = max(largest_error, abs(score[k] - 1))
+            elif entering < 0 or score[k] > score[entering]:
+                entering = k
+        if largest_error <= _GAP:
+            if entering < 0 or score[entering] <= 1 + _GAP:
                 break
-            weighted[enters] = True
+            weighted[entering] = True
         change = _newton_step(lever, score, weighted, 1.0 if by_determinant else 2.0)
-        longest = np.inf
+        longest_step = np.inf
         along = np.zeros((d, d))
         for k in range(n):
             if change[k] < 0:
-                longest = min(longest, -weight[k] / change[k])
+                longest_step = min(longest_step, -weight[k] / change[k])
             for i in range(d):
                 for j in range(d):
                     along[i, j] += change[k] * info[k, i, j]
-        if not 0 < longest < np.inf:
+        if not 0 < longest_step < np.inf:
             break
         # Close to the optimum plain steps: the slope along weights that change next to nothing is rounding.
-        step = _search_line(along, B, by_determinant, longest) if off > 1e-6 else min(1.0, longest)
+        step = _search_line(along, B, by_determinant, longest_step) if largest_error > 1e-6 else min(1.0, longest_step)
         for k in range(n):
-            gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
-            weighted[k] = weighted[k] and not gone
+            leaves = step == longest_step and change[k] < 0 and -weight[k] / change[k] <= longest_step * (1 + 1e-9)
+            weighted[k] = weighted[k] and not leaves
             weight[k] = max(weight[k] + step * change[k], 0.0) if weighted[k] else 0.0
         weight /= weight.sum()
     _share_weight(info, weight, weighted | (score >= 1 - _ALIKE))
@@ -211,8 +211,8 @@ def _best_weights(information: Float, by_determinant: bool) -> Float:
 def _share_weight(info: Float, weight: Float, among: Bool) -> None:
     """Of all weights `among` these inputs that give the same Σ wᵢIᵢ, take those with the least Σ wᵢ², in place.
 
-    They are wᵢ = max(0, ⟨Λ, Iᵢ⟩) for some symmetric Λ, and Newton's method finds it, penalised by _SOFT · |Λ|²/2: of
-    inputs that differ by less than 1e-6 it thus lets the sum be off a little, rather than amplify rounding.
+    They are wᵢ = max(0, ⟨Λ, Iᵢ⟩) for some symmetric Λ; Newton's method finds it, penalised by _SOFT · |Λ|²/2: of inputs
+    that differ by less than 1e-6 the sum may be off a little, rather than rounding amplified.
     """
     sharing = np.flatnonzero(among)
     c, d = len(sharing), info.shape[1]
@@ -231,7 +231,7 @@ def _share_weight(info: Float, weight: Float, among: Bool) -> None:
     soft = _SOFT * largest**2
     multiplier, root = np.zeros(size), np.empty((size, size))
     share, is_positive = np.zeros(c), np.ones(c, dtype=np.bool_)
-    settled = 0
+    settled_rounds = 0
     for _ in range(50):
         residual, curvature = target.copy(), np.zeros((size, size))
         for e in range(size):
@@ -244,15 +244,15 @@ def _share_weight(info: Float, weight: Float, among: Bool) -> None:
                         curvature[e, f] += entries[p, e] * entries[p, f]
         invert_root(curvature, root)
         multiplier += solve_with_root(root, residual)
-        settled += 1
+        settled_rounds += 1
         for p in range(c):
             total = 0.0
             for e in range(size):
                 total += multiplier[e] * entries[p, e]
             if is_positive[p] != (total > 0):
-                settled = 0
+                settled_rounds = 0
             share[p], is_positive[p] = max(total, 0.0), total > 0
-        if settled == 3:  # one step solves it, two more take off what rounding left
+        if settled_rounds == 3:  # one step solves it, two more take off what rounding left
             for p in range(c):
                 weight[sharing[p]] = share[p]
             weight /= weight.sum()
@@ -261,7 +261,7 @@ def _share_weight(info: Float, weight: Float, among: Bool) -> None:
 
 @callee
 def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
-    """Change to coordinates in which Σ wᵢIᵢ = 1, in place."""
+    """Changes `info` and B to coordinates in which Σ wᵢIᵢ = 1, in place."""
     n, d = info.shape[:2]
     total, half, factor = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
     for k in range(n):
@@ -297,7 +297,7 @@ def _whiten(info: Float, weight: Float, B: Float, by_determinant: bool) -> None:
 
 @callee
 def _newton_step(lever: Float, score: Float, weighted: Bool, times: float) -> Float:
-    """Newton's change of the weights (n,), its sum 0; inputs without weight keep none."""
+    """Newton's change of the weights (n,), which sums to 0; inputs without weight (`weighted` False) keep none."""
     active = np.flatnonzero(weighted)
     c, d = len(active), lever.shape[1]
     curvature, root = np.empty((c, c)), np.empty((c, c))
@@ -320,7 +320,7 @@ def _newton_step(lever: Float, score: Float, weighted: Bool, times: float) -> Fl
 
 @callee
 def _search_line(along: Float, B: Float, by_determinant: bool, longest: float) -> float:
-    """How far to go from J = 1 along `along` until the criterion hardly falls any more: at most `longest`."""
+    """The step (≤ `longest`) from J = 1 along `along` at which the criterion hardly falls any more."""
     first = _criterion_slope(0.0, along, B, by_determinant)
     low, high, step = 0.0, np.inf, min(1.0, longest)
     for _ in range(60):
@@ -429,7 +429,7 @@ def solve_with_root(root: Float, right: Float) -> Float:
 
 @callee
 def _safe_determinant(matrix: Float) -> float:
-    """The determinant; 0 where rounding leaves a matrix that is not positive definite."""
+    """The determinant of a symmetric matrix; 0 where rounding leaves one that is not positive definite."""
     d = len(matrix)
     if d == 2:
         return float(matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0])

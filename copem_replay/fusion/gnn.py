@@ -79,7 +79,7 @@ class Gnn(ListFusion):
     @model_validator(mode="before")
     @classmethod
     def _said(cls, values: Any) -> Any:
-        """Defaults of the keys of one way to combine, so that an experiment that is written back has them."""
+        """The keys with defaults of the way to combine, so that an experiment that is written back has them."""
         if not isinstance(values, dict):
             return values
         defaults = dict(_KEYS_OF.get(str(values.get("combine")), {}))
@@ -114,7 +114,7 @@ class Gnn(ListFusion):
         return None
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Fuse every run by itself."""
+        """The fused lists of each run: clusters by one optimal assignment per list, members combined by `combine`."""
         runs = []
         method = self._method
         informed = method is None and self.combine not in ("covariance_intersection", "fast_covariance_intersection")

@@ -131,7 +131,7 @@ def intersect_clusters(clusters: EntryClusters, by_determinant: bool, fast: bool
 def _collect_points(
     entries: Entries, content: Float, bounds: Int, newest: Int, min_existence: float
 ) -> tuple[Points, Int]:
-    """Entries that count, list by list, in order of content, (M,), and where those of each list begin, (F + 1,)."""
+    """Entries that count (M,), by list and in each by content, and (F + 1,) where each list begins."""
     needed = np.zeros(len(bounds) - 1, np.bool_)
     for frame in newest.flat:
         if frame >= 0:
@@ -160,7 +160,7 @@ def _collect_points(
 def _order_lists(
     newest: Int, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float, lists: Int
 ) -> int:
-    """Puts the lists that count into `lists`: newest capture first, then longest, then by content; returns how many."""
+    """Fills `lists` with lists that count, newest capture first, then longest, then by content; returns how many."""
     n = 0
     for f in newest:
         if f < 0 or first[f] == first[f + 1]:
@@ -178,7 +178,7 @@ def _order_lists(
 def _list_before(
     f: Any, g: Any, captured_s: Float, arrives_s: Float, points: Points, first: Int, content: Float
 ) -> bool:
-    """Whether list f comes before list g: see `_order_lists`."""
+    """Whether list f comes before list g: by newer capture, then more entries, then content, then arrival."""
     if captured_s[f] != captured_s[g]:
         return bool(captured_s[f] > captured_s[g])
     n, m = first[f + 1] - first[f], first[g + 1] - first[g]
@@ -198,9 +198,8 @@ def _list_before(
 def _find_allowed_pairs(
     new: Points, clusters: Points, by_x: Int, agree: Bool, gate: float, row: Int, col: Int, cost: Float, spread: Float
 ) -> tuple[Int, Int, Float, Float, int]:
-    """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component.
-
-    The arrays returned are those handed in, or longer ones. The last number returned is that of the pairs.
+    """Pairs within the gate whose classes agree: entry, cluster, cost below 0, largest ln|S| of the component. The
+    arrays returned are those handed in, or longer ones. The last number is how many pairs there are.
     """
     n = low = 0
     widest = 0.0
@@ -272,7 +271,7 @@ def _sort_by_x(clusters: Points, by_x: Int) -> None:
 
 @callee
 def _group_members(joining: Int, claimed: Int, member: Int, begin: Int) -> None:
-    """Writes joined entries into `member`, those of cluster c from `begin[c]` on; `begin[0]` is set before."""
+    """Fills `member` with the entries `joining`, those of cluster c from `begin[c]` on; `begin[0]` is set before."""
     count = len(begin) - 1
     for c in range(count):
         begin[c + 1] = 0

@@ -155,8 +155,7 @@ def _find_contributions(
     received: Tracks, instants: FusionSchedule, beside: BesideNewest, without_object_ix: int, cached: KeptEntries | None
 ) -> tuple[Int, Int, Int, Int]:
     """Contributions: the rows (C,) of `received` that make up each fused row, start (P + 1,), object and instant (P,).
-
-    Entries without truth id (of recorded units) contribute to none.
+    Entries without truth id (of recorded units) and those of `without_object_ix` contribute to none.
     """
     order, bounds = received.by_frame
     begin, count = bounds[:-1], np.diff(bounds)
@@ -165,17 +164,17 @@ def _find_contributions(
         order = np.append(order, order[cached.entry])
     instant, frame = _select_lists(received, instants, beside, cached)
     begin, count = begin[frame], count[frame]
-    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    rows = order[np.repeat(begin, count) + within]
+    offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    rows = order[np.repeat(begin, count) + offset]
     instant = np.repeat(instant, count)
     object_ix = received.row_object_ix[rows]
-    keep = (object_ix != without_object_ix) & (object_ix >= 0)
-    rows, instant, object_ix = rows[keep], instant[keep], object_ix[keep]
+    is_kept = (object_ix != without_object_ix) & (object_ix >= 0)
+    rows, instant, object_ix = rows[is_kept], instant[is_kept], object_ix[is_kept]
     # Rows of an object are in order of instants and units already; the sort of small integers is fast.
     order_by_object = np.argsort(object_ix.astype(np.min_scalar_type(object_ix.max(initial=0))), kind="stable")
     rows, instant, object_ix = rows[order_by_object], instant[order_by_object], object_ix[order_by_object]
-    new = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
-    return rows, np.append(new, len(rows)), object_ix[new], instant[new]
+    first_rows = np.flatnonzero((np.diff(object_ix, prepend=-1) != 0) | (np.diff(instant, prepend=-1) != 0))
+    return rows, np.append(first_rows, len(rows)), object_ix[first_rows], instant[first_rows]
 
 
 def _select_newest_entries(received: Tracks, rows: Int, start: Int) -> tuple[Bool, Int, Int]:
@@ -192,9 +191,8 @@ def _select_newest_entries(received: Tracks, rows: Int, start: Int) -> tuple[Boo
 
 @borrowing_kernel
 def _drop_older_entries(valid: Bool, rows: Int, start: Int, unit_ix: Int, counts: Bool) -> None:
-    """Sets `counts` False at detected rows behind a newer detected one of their unit and object.
-
-    Contributions are in the order of units, and of each unit the newest is the first.
+    """Sets `counts` False at detected rows behind a newer detected one of their unit and object. Contributions are in
+    the order of units, and of each unit the newest is the first.
     """
     for s in range(valid.shape[0]):
         for p in range(len(start) - 1):
@@ -260,7 +258,7 @@ class WeightedRows(NamedTuple):
 
     @classmethod
     def of(cls, received: Tracks) -> WeightedRows:
-        """Values and weights of the rows of `received`."""
+        """Values of the rows of `received`, and the weights (inverse variances) that they have when combined."""
         zeros = np.zeros((1, len(received.frame_ix)))
         information = [
             1 / np.maximum(zeros if variance is None else variance, SMALLEST_VARIANCE)
@@ -279,9 +277,8 @@ def _stated_variances(received: Tracks) -> list[Float | None]:
 def _combine_scalars(
     received: Tracks, counts: Bool, weighed: WeightedRows, rows: Int, start: Int, out: dict[str, Float]
 ) -> dict[str, Float]:
-    """Put inverse-variance means (S, P) of scalars over the contributions into `out`; return their variances.
-
-    `counts (S, P)`: which rows contribute.
+    """Fills `out` with inverse-variance means (S, P) of scalars; returns their variances, NaN: none contributes.
+    `counts`: which rows contribute.
     """
     shape = len(counts), len(start) - 1
     means, spreads = np.full((len(_WEIGHED_BY), *shape), np.nan), np.full((_ALIKE + 1, *shape), np.nan)
@@ -341,7 +338,7 @@ class PositionInformation(NamedTuple):
 def _combine_position(
     valid: Bool, given: Positions, information: PositionInformation, rows: Int, start: Int, out: Positions
 ) -> None:
-    """Writes the combined positions and covariances (S, P) into `out`; rows without contribution stay as they are."""
+    """Fills `out` with combined positions and covariances (S, P); rows without contribution stay as they are."""
     x, y, cov_ee, cov_en, cov_nn = given
     ee, en, nn = information
     out_x, out_y, out_ee, out_en, out_nn = out
@@ -350,19 +347,19 @@ def _combine_position(
         j = s if x.shape[0] > 1 else 0
         for p in range(out_x.shape[1]):
             a = b = d = u = v = x0 = y0 = 0.0
-            n, last = 0, -1
+            n, last_row = 0, -1
             for c in range(start[p], start[p + 1]):
                 r = rows[c]
                 if not valid[s, r]:
                     continue
                 if n == 0:  # relative to the first: weights of exact states are large
                     x0, y0 = x[j, r], y[j, r]
-                n, last = n + 1, r
+                n, last_row = n + 1, r
                 dx, dy = x[j, r] - x0, y[j, r] - y0
                 a, b, d = a + ee[i, r], b + en[i, r], d + nn[i, r]
                 u, v = u + ee[i, r] * dx + en[i, r] * dy, v + en[i, r] * dx + nn[i, r] * dy
             if n == 1:  # as it is, to the last bit
-                out_ee[s, p], out_en[s, p], out_nn[s, p] = cov_ee[i, last], cov_en[i, last], cov_nn[i, last]
+                out_ee[s, p], out_en[s, p], out_nn[s, p] = cov_ee[i, last_row], cov_en[i, last_row], cov_nn[i, last_row]
                 out_x[s, p], out_y[s, p] = x0, y0
             elif n:
                 det = a * d - b * b
@@ -375,16 +372,15 @@ def _sum_scalars(
     valid: Bool, values: Float, weights: Float, weighed_by: Int, rows: Int, start: Int, means: Float, spreads: Float,
     scratch: tuple[Int, Bool],
 ) -> None:  # fmt: skip
-    """Writes weighted means `(V, S, fused rows)` and variances `(W, S, fused rows)`, where anything contributes.
-
-    `values (S | 1, P, V)` and `weights (S | 1, P, W)` have one row where all runs agree.
+    """Fills `means (V, S, fused rows)` and `spreads (W, S, fused rows)`, variances, where anything contributes. `values
+    (S | 1, P, V)` and `weights (S | 1, P, W)` have one row where all runs agree.
     """
-    contributing, equal = scratch
+    contributing, is_equal = scratch
     for p in range(len(start) - 1):  # whether all that may contribute agree, in any run
         for v in range(values.shape[2]):
-            equal[p, v] = values.shape[0] == 1
+            is_equal[p, v] = values.shape[0] == 1
             for c in range(start[p] + 1, start[p + 1]):
-                equal[p, v] &= values[0, rows[c], v] == values[0, rows[start[p]], v]
+                is_equal[p, v] &= values[0, rows[c], v] == values[0, rows[start[p]], v]
     for s in range(valid.shape[0]):
         value = values[s if values.shape[0] > 1 else 0]
         weight = weights[s if weights.shape[0] > 1 else 0]
@@ -404,7 +400,7 @@ def _sum_scalars(
             for v in range(means.shape[0]):
                 w, first = weighed_by[v], value[contributing[0], v]
                 moment = 0.0
-                for c in range(1, 1 if equal[p, v] else n):
+                for c in range(1, 1 if is_equal[p, v] else n):
                     moment += weight[contributing[c], w] * (value[contributing[c], v] - first)
                 if moment != 0.0:
                     total = 0.0

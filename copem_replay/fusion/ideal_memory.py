@@ -64,10 +64,10 @@ class _Listed(NamedTuple):
 
 @kernel
 def _filter_objects(heard: _Heard, listed: _Listed, q_m2ps3: float, speed_var_m2ps2: float, out: Float) -> None:
-    # Fills `out (8, S, Q)` where an object is listed.
+    """Fills `out (8, S, Q)` where an object is listed: x, y, vx, vy, position covariance, speed variance."""
     for e in range(len(heard.first)):
-        most = heard.after[e] - heard.first[e]
-        sequence, states, P = np.empty(most, np.int64), np.empty((most, 4)), np.empty((most, 4, 4))
+        most_rows = heard.after[e] - heard.first[e]
+        sequence, states, P = np.empty(most_rows, np.int64), np.empty((most_rows, 4)), np.empty((most_rows, 4, 4))
         now, P_now = np.empty(4), np.empty((4, 4))
         for s in range(len(heard.valid)):
             n, i = 0, heard.first[e]
@@ -104,7 +104,7 @@ def _insert(sequence: Int, n: int, row: int, captured_s: Float) -> int:
 def _filter(
     heard: _Heard, s: int, sequence: Int, changed: int, q_m2ps3: float, speed_var_m2ps2: float, states: Float, P: Float
 ) -> None:
-    # The state after each row of a sequence, from the place `changed` on.
+    """Fills `states`, P with the filter's state after each row of a sequence, from place `changed` on."""
     for j in range(changed, len(sequence)):
         r = sequence[j]
         x, y, vx, vy, ee, en, nn = heard.states[:, s if heard.states.shape[1] > 1 else 0, r]

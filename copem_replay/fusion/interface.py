@@ -175,14 +175,14 @@ class StepFusion(ListFusion):
         return self.resume(inputs, None)[0]
 
     def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
-        """The lists at the next instants, and what is remembered: for each run the memory that its last step gave."""
+        """The lists at the next instants, and each run's memory after them. GivenError: a step gives no such pair."""
         runs, instants = len(inputs.lists.start), len(inputs.issue_s)
         start = np.zeros((runs, instants + 1), dtype=np.int64)
-        parts: list[Entries] = []
-        total = 0
+        entry_parts: list[Entries] = []
+        entry_count = 0
         memories = [None] * runs if memory is None else list(memory)
         for s in range(runs):
-            start[s, 0] = total
+            start[s, 0] = entry_count
             for k in range(instants):
                 answer = self.step(float(inputs.issue_s[k]), make_inbox(inputs, s, k), memories[s])
                 if not isinstance(answer, tuple) or len(answer) != 2:
@@ -191,10 +191,10 @@ class StepFusion(ListFusion):
                 if not isinstance(entries, np.ndarray) or entries.dtype != ENTRY or entries.ndim != 1:
                     found = entries.dtype.name if isinstance(entries, np.ndarray) else type(entries).__name__
                     raise GivenError("step", f"expected a list (an array of ENTRY) and a memory, found {found}")
-                parts.append(entries)
-                total += len(entries)
-                start[s, k + 1] = total
-        return ObjectLists(start, np.concatenate([inputs.lists.entries[:0], *parts])), memories
+                entry_parts.append(entries)
+                entry_count += len(entries)
+                start[s, k + 1] = entry_count
+        return ObjectLists(start, np.concatenate([inputs.lists.entries[:0], *entry_parts])), memories
 
 
 def ask_fusion(fusion: ListFusion, inputs: Inputs, where: str) -> ObjectLists:
@@ -277,25 +277,25 @@ def _has_track_twice(answer: ObjectLists) -> bool:
 
 
 def _has_arrived(answer: ObjectLists, inputs: Inputs) -> Bool:
-    """(N,) whether a list, or an entry, of the capture that an entry states has arrived when its list is issued."""
+    """(N,) whether a list, or an entry, of the capture that each entry states has arrived when its list is issued."""
     lengths, entry_s = np.diff(inputs.lists.start), inputs.lists.entries["captured_s"]
-    older = np.flatnonzero(entry_s != np.repeat(np.tile(inputs.captured_s, len(lengths)), lengths.ravel()))
-    frame = np.repeat(np.tile(np.arange(len(inputs.captured_s)), len(lengths)), lengths.ravel())[older]
-    captured_s, which = np.unique(np.append(inputs.captured_s, entry_s[older]), return_inverse=True)
+    older_entries = np.flatnonzero(entry_s != np.repeat(np.tile(inputs.captured_s, len(lengths)), lengths.ravel()))
+    frame = np.repeat(np.tile(np.arange(len(inputs.captured_s)), len(lengths)), lengths.ravel())[older_entries]
+    captured_s, capture_ix = np.unique(np.append(inputs.captured_s, entry_s[older_entries]), return_inverse=True)
     first_s = np.full(len(captured_s), np.inf)
-    np.minimum.at(first_s, which, np.append(inputs.arrives_s, inputs.arrives_s[frame]))
-    arrived: Bool = np.zeros(len(answer.entries), dtype=bool)
+    np.minimum.at(first_s, capture_ix, np.append(inputs.arrives_s, inputs.arrives_s[frame]))
+    has_arrived: Bool = np.zeros(len(answer.entries), dtype=bool)
     if len(captured_s):
         entry_s = np.ascontiguousarray(answer.entries["captured_s"])
-        _mark_arrived(answer.start, entry_s, inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, arrived)
-    return arrived
+        _mark_arrived(answer.start, entry_s, inputs.issue_s, captured_s, first_s, SAME_INSTANT_S, has_arrived)
+    return has_arrived
 
 
 @kernel
 def _mark_arrived(
     start: Int, entry_s: Float, issue_s: Float, captured_s: Float, first_s: Float, tolerance_s: float, arrived: Bool
 ) -> None:
-    """Sets `arrived (N,)` where a list of the stated capture has arrived by the instant; captures (C,) ascend."""
+    """Sets `arrived (N,)` where a list of the stated capture has arrived; captures (C,) ascend, `first_s`: arrival."""
     for s in range(len(start)):
         f = 0
         for k in range(len(issue_s)):

@@ -38,7 +38,7 @@ class Nms(ListFusion):
     resumable: ClassVar[bool] = True
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Fuse every run by itself."""
+        """The lists of each run without entries that overlap a more certain one; entries stay as they are."""
         runs = []
         for run in inputs.lists.start:
             bounds = run - run[0]
@@ -68,7 +68,7 @@ class Nms(ListFusion):
 
 
 def _order_entries(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
-    """(N,) entries in the order in which they are considered: by their content, of equal ones the first to arrive."""
+    """(N,) entries in the order in which they are considered: the most certain first, then the first to arrive."""
     f = np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
     keys = np.column_stack(
         [
@@ -85,26 +85,23 @@ def _order_entries(entries: Entries, bounds: Int, inputs: Inputs) -> Int:
 def _suppress_overlapping(
     entries: Entries, place: Float, kind: Int, order: Int, start: Int, rows: Int, agree: Bool, by_iou: bool, iou: float
 ) -> tuple[Int, Int]:
-    """Where the kept entries of each instant begin, (K + 1,), and their rows. `rows, start`: those of all.
-
-    `place (3, N)`: x, y and reach.
-    """
+    """(K + 1,) where the kept entries of each instant begin, and their rows. `place (3, N)`: x, y, reach (m)."""
     kept_rows, kept_start = np.empty_like(rows), np.zeros_like(start)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     n = 0
     for k in range(len(start) - 1):
         for r in order[np.sort(rank[rows[start[k] : start[k + 1]]])]:
-            free = True
+            is_free = True
             for q in range(kept_start[k], n):
                 s = kept_rows[q]
                 dx, dy, reach = place[0, r] - place[0, s], place[1, r] - place[1, s], place[2, r] + place[2, s]
                 if dx * dx + dy * dy > reach * reach or not agree[kind[r], kind[s]]:
                     continue
                 if not by_iou or _iou_of_entries(entries[r], entries[s]) > iou:
-                    free = False
+                    is_free = False
                     break
-            if free:
+            if is_free:
                 kept_rows[n] = r
                 n += 1
         kept_start[k + 1] = n

@@ -102,7 +102,7 @@ def split_by_variance(cov: Float, dependent_m2: float) -> tuple[Float, Float]:
 
 @callee
 def _best_weights(dependent: Float, independent: Float, by_determinant: bool) -> Float:
-    """Weights (n,) that minimise the determinant or the trace of P."""
+    """Weights (n,), sum 1, that minimise the determinant or the trace of P, by Newton's method."""
     n, d = dependent.shape[:2]
     weight = np.full(n, 1.0 / n)
     if n == 1:
@@ -113,39 +113,39 @@ def _best_weights(dependent: Float, independent: Float, by_determinant: bool) ->
     value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
     for _ in range(40 + 4 * n):
         _derive_terms(dependent, independent, weight, by_determinant, P, lever, score, bend)
-        mean = off = 0.0
+        mean = largest_error = 0.0
         for k in range(n):
             mean += weight[k] * score[k]
         if not mean > 0:  # no dependent parts: weights change nothing
             break
-        enters = -1
+        entering = -1
         for k in range(n):
             if weighted[k]:
-                off = max(off, abs(score[k] / mean - 1))
-            elif enters < 0 or score[k] > score[enters]:
-                enters = k
-        if off <= _GAP:
-            if enters < 0 or score[enters] <= (1 + _GAP) * mean:
+                largest_error = max(largest_error, abs(score[k] / mean - 1))
+            elif entering < 0 or score[k] > score[entering]:
+                entering = k
+        if largest_error <= _GAP:
+            if entering < 0 or score[entering] <= (1 + _GAP) * mean:
                 break
-            weighted[enters] = True
+            weighted[entering] = True
         change = _newton_step(lever, score / mean, bend / mean, weighted, P, mean, by_determinant)
-        longest, fall = np.inf, 0.0
+        longest_step, fall = np.inf, 0.0
         for k in range(n):
             fall += score[k] * change[k]
             if change[k] < 0:
-                longest = min(longest, -weight[k] / change[k])
-        if not 0 < longest < np.inf:
+                longest_step = min(longest_step, -weight[k] / change[k])
+        if not 0 < longest_step < np.inf:
             break
-        step = min(1.0, longest)
+        step = min(1.0, longest_step)
         for _ in range(40):
-            tried = np.maximum(weight + step * change, 0.0)
-            lower = _evaluate_criterion(dependent, independent, tried, by_determinant, information, total, P)
-            if off <= _CLOSE or lower <= value - 1e-4 * step * fall:
+            tried_weight = np.maximum(weight + step * change, 0.0)
+            lower = _evaluate_criterion(dependent, independent, tried_weight, by_determinant, information, total, P)
+            if largest_error <= _CLOSE or lower <= value - 1e-4 * step * fall:
                 break
             step /= 2
         for k in range(n):
-            gone = step == longest and change[k] < 0 and -weight[k] / change[k] <= longest * (1 + 1e-9)
-            weighted[k] = weighted[k] and not gone
+            leaves = step == longest_step and change[k] < 0 and -weight[k] / change[k] <= longest_step * (1 + 1e-9)
+            weighted[k] = weighted[k] and not leaves
             weight[k] = max(weight[k] + step * change[k], 0.0) if weighted[k] else 0.0
         weight /= weight.sum()
         value = _evaluate_criterion(dependent, independent, weight, by_determinant, information, total, P)
@@ -157,7 +157,7 @@ def _evaluate_criterion(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, information: Float, total: Float,
     P: Float,
 ) -> float:  # fmt: skip
-    """Trace or logarithm of the determinant of P; writes P and what each input contributes to its inverse."""
+    """Trace of P or logarithm of its determinant; fills P and what each input contributes to its inverse."""
     n, d = dependent.shape[:2]
     spread = np.empty((d, d))
     total[:] = 0.0
@@ -187,7 +187,7 @@ def _derive_terms(
     dependent: Float, independent: Float, weight: Float, by_determinant: bool, P: Float, lever: Float, score: Float,
     bend: Float,
 ) -> None:  # fmt: skip
-    """Of each input PJ′ (n, d, d), its score ⟨PJ′, P⟩ or trace PJ′, and −⟨PJ″, P⟩ or −trace PJ″ (n,)."""
+    """Fills for each input PJ′ (n, d, d), its score ⟨PJ′, P⟩ or trace PJ′, and −⟨PJ″, P⟩ or −trace PJ″ (n,)."""
     n, d = dependent.shape[:2]
     spread, inverse, first = np.empty((d, d)), np.empty((d, d)), np.empty((d, d))
     for k in range(n):

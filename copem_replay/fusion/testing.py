@@ -119,7 +119,7 @@ class SmallScene:
     said: tuple[tuple[Entries, ...], ...]
 
     def inputs(self) -> Inputs:
-        """The scene as the input of a fusion."""
+        """The scene as the input of a fusion: its lists in three runs, with arrivals and units."""
         runs, count = len(self.said), len(self.unit_ix)
         lists = [entries_of_list for run in self.said for entries_of_list in run]
         lengths = np.array([len(entries_of_list) for entries_of_list in lists], dtype=np.int64)
@@ -191,6 +191,7 @@ def make_small_scenes(seed: int) -> list[SmallScene]:
 def _make_scene(
     rng: np.random.Generator, name: str, units: int, n: int, width_m: float, lists: int, late_s: float, p_lost: float
 ) -> SmallScene:
+    """A scene of n objects in a square of `width_m`, listed by units with delays up to `late_s` and lost lists."""
     unit_ix = np.repeat(np.arange(units), lists)
     # Every other unit captures at the same instants.
     phase_s = np.where(np.arange(units) % 2 == 0, 0.0, rng.uniform(0.0, 0.1, units)) * (late_s > 0)
@@ -322,24 +323,24 @@ class _FusionTrial:
         return NonconformingError(rule, self.fusion.kind, f"Scene {scene.name!r}{when}", str(text))
 
     def answer(self, scene: SmallScene) -> ObjectLists:
-        """The lists that the fusion gives for a scene, checked."""
+        """The lists that the fusion gives for a scene. Raises the trial's error where it fails or they are no lists."""
         self.asked["answer"] += 1
         self.asked["inputs"] += 1
         inputs = scene.inputs()
-        before = _content_bytes(inputs)
+        bytes_before = _content_bytes(inputs)
         try:
             lists = self.fusion.fuse(inputs)
         except Exception as error:
             failed = _failed_step(self.fusion, scene.inputs()) if isinstance(self.fusion, StepFusion) else None
             failed = failed or (f"expected Lists, found {type(error).__name__}: {error}", -1, 0.0)
             raise self.broken("answer", scene, *failed) from error
-        if changed := [name for name, now in _content_bytes(inputs).items() if now != before[name]]:
+        if changed := [name for name, now in _content_bytes(inputs).items() if now != bytes_before[name]]:
             raise self.broken("inputs", scene, f"expected reports as before, found {', '.join(changed)} changed")
         if wrong := form_problem(lists, inputs):
             raise self.broken("answer", scene, wrong)
         for s, k in np.ndindex(len(scene.said), len(inputs.issue_s)) if content_problem(lists, inputs) else ():
-            alone = ObjectLists(np.array([[0, len(lists.of(s, k))]]), lists.of(s, k))
-            if wrong := content_problem(alone, replace(inputs, issue_s=inputs.issue_s[k : k + 1])):
+            single_list = ObjectLists(np.array([[0, len(lists.of(s, k))]]), lists.of(s, k))
+            if wrong := content_problem(single_list, replace(inputs, issue_s=inputs.issue_s[k : k + 1])):
                 raise self.broken("answer", scene, wrong, s, float(inputs.issue_s[k]))
         return lists
 
@@ -351,7 +352,7 @@ class _FusionTrial:
         self.compare(rule, first, self.answer(scene), scene, until_s)
 
     def resumed(self, first: ObjectLists, cuts: Int) -> None:
-        """Check that the scene's instants, cut at these places, get the lists of `first`, to the last bit."""
+        """Check that the scene's instants, cut at `cuts`, get the lists of `first`, to the last bit."""
         inputs, memory = self.scene.inputs(), None
         parts: list[ObjectLists] = []
         scene = replace(self.scene, name=f"{self.scene.name}; instants in time chunks")
@@ -369,7 +370,7 @@ class _FusionTrial:
         self.compare("chunks", first, join_chunks(parts), scene, np.inf)
 
     def compare(self, rule: str, first: ObjectLists, answer: ObjectLists, scene: SmallScene, until_s: float) -> None:
-        """Check that the lists found for a scene are those of `first`: as sets, or to the last bit."""
+        """Check that the lists `answer` of a scene are those of `first`: as sets, or (some rules) to the last bit."""
         self.asked[rule] += 1
         issue_s = scene.inputs().issue_s
         exact = rule in ("again", "runs", "chunks")
@@ -395,7 +396,7 @@ def _content_bytes(inputs: Inputs) -> dict[str, bytes]:
 
 
 def _failed_step(fusion: StepFusion, inputs: Inputs) -> tuple[str, int, float] | None:
-    """What a step gives instead of entries and memory, the run and the instant; None: no step fails."""
+    """What a step gives instead of entries and memory, the run and the instant (s); None: no step fails."""
     memory = None
     for s, k in np.ndindex(len(inputs.lists.start), len(inputs.issue_s)):
         try:

@@ -95,7 +95,7 @@ class Tracker(ListFusion):
     def resume(
         self, inputs: Inputs, memory: Sequence[StoredMemory] | None
     ) -> tuple[ObjectLists, Sequence[StoredMemory]]:
-        """The lists at the next instants, and what is remembered: the tracks of each run."""
+        """The lists at the next instants, and the memory (tracks) of each run after them; `memory` None: none yet."""
         keeps_s = np.zeros(len(inputs.units)) if inputs.keeps_s is None else inputs.keeps_s
         rules = TrackerRules(
             _LATE[self.late], self.acceleration_psd_m2ps3, self.speed_sigma_mps**2, -2 * math.log1p(-self.gate),

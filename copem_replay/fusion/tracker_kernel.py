@@ -272,7 +272,7 @@ def update_split(state: Float, P: Float, common: Float, z: Float, share: float, 
 
 @callee
 def _updated_determinant(omega: float, P: Float, common: Float, z: Float, share: float, own_share: float) -> float:
-    """The determinant of P after the update: |P₁| |R₁| / |HP₁Hᵀ + R₁|, P₁ by blocks of position and velocity."""
+    """The determinant of P after the update with weight ω: |P₁| |R₁| / |HP₁Hᵀ + R₁|, P₁ by blocks."""
     factor, scale = 1.0 / omega - 1.0, share / (1.0 - omega) + own_share
     a, b, d = P[0, 0] + factor * common[0, 0], P[0, 1] + factor * common[0, 1], P[1, 1] + factor * common[1, 1]
     det = a * d - b * b
@@ -300,7 +300,7 @@ def _split_gain(inflated: Float, ee: float, en: float, nn: float) -> Float:
 
 @callee
 def _update_covariance(independent: Float, gain: Float, ee: float, en: float, nn: float) -> Float:
-    """(1 − KH) N (1 − KH)ᵀ + K R Kᵀ, symmetric."""
+    """(4, 4) covariance (1 − KH) N (1 − KH)ᵀ + K R Kᵀ, symmetric; N `independent`, K `gain`."""
     half, out = np.empty((4, 4)), np.empty((4, 4))
     for i in range(4):
         for j in range(4):
@@ -392,9 +392,8 @@ def _replay_memory(
     rules: TrackerRules,
 ) -> tuple[TrackerMemory, list[TrackerMemory], Int]:
     """The memory as if the lists `arriving` had been received at their captures, those before each, and these lists.
-
-    Goes back to the memory `before` the first list that was captured no earlier than the oldest `arriving`, and hears
-    all lists from there on again.
+    Goes back to the memory before the first list that was captured no earlier than the oldest arriving one, and hears
+    all from there on again.
     """
     if len(received):
         oldest_s = unit_lists.captured_s[received[-1]] - rules.buffer_s - SAME_INSTANT_S
@@ -425,7 +424,7 @@ def _replay_memory(
 
 @callee
 def _publish_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float, out: Entries) -> int:
-    """Writes the tracks that are published now to the front of `out`; returns their number."""
+    """Fills the front of `out` with the tracks that are published, predicted to `now_s`; returns their number."""
     state, P = np.empty(4), np.empty((4, 4))
     n = 0
     for j in range(len(memory.tracks)):
@@ -456,7 +455,7 @@ def _publish_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float, ou
 def _hear_list(
     memory: TrackerMemory, unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float
 ) -> TrackerMemory:
-    """Takes in list f as of `now_s`: every track is predicted to then, updated, or founded."""
+    """The memory after list f, as of `now_s`: tracks are predicted to then, and updated or founded by its entries."""
     for track in memory.tracks:
         if track.at_s < now_s:
             predict_state(track.state, track.P, now_s - track.at_s, rules.q_m2ps3)
@@ -510,11 +509,11 @@ def _hear_list(
 
 @callee
 def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s: float) -> Float:
-    """Places and their covariances (n, 5): x, y, ee, en, nn of the entries of list f as of `now_s`."""
+    """(n, 5) position and covariance (x, y, ee, en, nn) of the entries of list f, predicted to `now_s` if set so."""
     rows = unit_lists.rows[unit_lists.start[f] : unit_lists.start[f + 1]]
     z = np.empty((len(rows), 5))
     age_of_information_s = max(now_s - unit_lists.captured_s[f], 0.0) if rules.late == PREDICT else 0.0
-    grown = rules.q_m2ps3 * age_of_information_s**3 / 3
+    added_m2 = rules.q_m2ps3 * age_of_information_s**3 / 3
     for i in range(len(rows)):
         entry = unit_lists.entries[rows[i]]
         z[i, 0], z[i, 1] = (
@@ -522,13 +521,13 @@ def _entry_positions(unit_lists: HeardLists, rules: TrackerRules, f: int, now_s:
             entry.y_m + age_of_information_s * entry.vy_mps,
         )
         ee, en, nn = floor_eigenvalues(entry.cov_ee_m2, entry.cov_en_m2, entry.cov_nn_m2)
-        z[i, 2], z[i, 3], z[i, 4] = ee + grown, en, nn + grown
+        z[i, 2], z[i, 3], z[i, 4] = ee + added_m2, en, nn + added_m2
     return z
 
 
 @callee
 def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: TrackerRules, rows: Int, z: Float) -> Int:
-    """The track of each entry (n,), −1: none. Least sum of d² + ln|S| over the pairs within the gate."""
+    """(n,) the track of each entry, −1: none. Least sum of d² + ln|S| over the pairs within the gate."""
     n, m = len(rows), len(tracks)
     partner = np.full(n, -1)
     if n == 0 or m == 0:
@@ -564,7 +563,7 @@ def _assign_entries(tracks: NDArray[Any], unit_lists: HeardLists, rules: Tracker
 
 @callee
 def _make_room(memory: TrackerMemory, added: int) -> TrackerMemory:
-    """The memory with `added` tracks at its end, which are empty."""
+    """The memory with `added` empty tracks at its end."""
     if added == 0:
         return memory
     n, units = memory.claims.shape
@@ -591,7 +590,7 @@ def _start_track(
 
 @callee
 def _describe_track(track: Any, entry: Any, captured_s: float) -> None:
-    """Takes in what the filter leaves out; of lists captured together the last one received counts as the newest."""
+    """Adds to a track what the filter leaves out: size, heading, class; of equal captures the last is newest."""
     if captured_s >= track.last_s:
         track.z_m, track.yaw_rad = entry.z_m, entry.yaw_rad
     track.first_s, track.last_s = min(track.first_s, captured_s), max(track.last_s, captured_s)
@@ -621,7 +620,7 @@ def _track_existence(claims: NDArray[Any], rules: TrackerRules, now_s: float) ->
 
 @callee
 def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> TrackerMemory:
-    """The memory without tracks that have faded, and without the younger of two tracks of one object, as of `now_s`."""
+    """The memory as of `now_s` without faded tracks, and without the younger of two tracks of one object."""
     n, units = memory.claims.shape
     keep = np.empty(n, np.bool_)
     for j in range(n):
@@ -643,7 +642,7 @@ def _settle_tracks(memory: TrackerMemory, rules: TrackerRules, now_s: float) -> 
 
 @callee
 def _is_one_object(memory: TrackerMemory, rules: TrackerRules, i: int, j: int, now_s: float) -> bool:
-    """Whether classes agree, no list held both of late, and the tracks are as close as two entries of one object."""
+    """Whether tracks i and j are of one object: classes agree, no list held both of late, they are close enough."""
     a, b = memory.tracks[i], memory.tracks[j]
     dx, dy = a.state[0] - b.state[0], a.state[1] - b.state[1]
     # P alone will not do: two tracks that share the entries of one object keep apart, and their P shrinks.

@@ -31,7 +31,7 @@ class Union(ListFusion):
     resumable: ClassVar[bool] = True
 
     def fuse(self, inputs: Inputs) -> ObjectLists:
-        """Fuse every run by itself."""
+        """All entries of the newest lists of each run; track ids are changed so that they differ between units."""
         runs = []
         for bounds in inputs.lists.start:
             entries = inputs.lists.entries[bounds[0] : bounds[-1]]

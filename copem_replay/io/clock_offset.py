@@ -216,7 +216,8 @@ class JointWays:
         return np.stack(columns, axis=-1) * p.other[None, :, None]
 
     def _weigh(self, residual: Float, bound: Float) -> None:
-        """Weights and scales for residuals (2, K); `bound (2, K)`: the leverage of each entry on its own residual.
+        """Sets weights and scales from residuals (2, K); `bound (2, K)`: the leverage of each entry on its own
+        residual.
 
         Weights depend on the residuals that they weigh, so errors move the solution more than fixed weights would: by
         `stretch`, the mean of both lists' factors, weighted by what their errors add to the variance of the solution.
@@ -316,18 +317,20 @@ def estimate_time_offset(
 def _estimate_offset(
     tracks: ShortTracks, other: ListPoints, within_s: tuple[float, float], shifted: bool
 ) -> TimeOffset:
-    """How far the clock of `other` is ahead of that of the tracks."""
+    """How far the clock of `other` is ahead of that of the tracks (s), sought `within_s`; `untold`: why not known.
+    `shifted`: positions of one list may be off by a constant vector.
+    """
     from_s, to_s = within_s
     if not len(tracks.time_s) or not len(other.time_s):
         return TimeOffset(untold="nothing in them can be followed from list to list")
     grid = np.arange(round(from_s / STEP_S), round(to_s / STEP_S) + 1) * STEP_S
-    few = other.thinned(_SCORED)
-    score = np.array([_score_offset(tracks, few, float(offset_s)) for offset_s in grid])
+    thinned_points = other.thinned(_SCORED)
+    score = np.array([_score_offset(tracks, thinned_points, float(offset_s)) for offset_s in grid])
     best = int(score.argmax())
     if score[best] < FEWEST / 2:
         return TimeOffset(untold=f"fewer than {FEWEST} entries of moving objects are in both")
-    if (rival := _find_rival(score, best)) is not None:
-        return TimeOffset(untold=f"{grid[best]:.2f} s and {grid[rival]:.2f} s fit equally well")
+    if (rival_ix := _find_rival(score, best)) is not None:
+        return TimeOffset(untold=f"{grid[best]:.2f} s and {grid[rival_ix]:.2f} s fit equally well")
     if best in (0, len(grid) - 1):
         return TimeOffset(untold=f"it is not within {from_s:g} … {to_s:g} s")
     estimate = TimeOffset(untold=f"fewer than {FEWEST} entries of moving objects are in both")
@@ -336,15 +339,15 @@ def _estimate_offset(
     if not len(chains.time_s):
         chains = replace(other, track=np.arange(len(other.time_s)))
     for faster_mps in (SLOW_MPS,) if shifted else (FAST_MPS, SLOW_MPS):
-        simple = _solve_offset(tracks, chains, float(grid[best]), faster_mps)
-        if simple is None:
+        plain_fit = _solve_offset(tracks, chains, float(grid[best]), faster_mps)
+        if plain_fit is None:
             continue
-        full = _Fit(simple.ways.pieces, simple.ways.offset_s, biased=True)
+        full = _Fit(plain_fit.ways.pieces, plain_fit.ways.offset_s, biased=True)
         if full.half_width(0) > BIAS_S:
-            estimate = _state_estimate(simple, unbiased=True)
+            estimate = _state_estimate(plain_fit, unbiased=True)
         else:
-            moved_s = abs(full.ways.offset_s - simple.ways.offset_s)
-            estimate = _state_estimate(full if shifted or moved_s > _CERTAIN * full.half_width(0) else simple)
+            moved_s = abs(full.ways.offset_s - plain_fit.ways.offset_s)
+            estimate = _state_estimate(full if shifted or moved_s > _CERTAIN * full.half_width(0) else plain_fit)
         if estimate.untold is None:
             break
     return estimate
@@ -365,16 +368,16 @@ def _solve_offset(tracks: ShortTracks, other: ListPoints, offset_s: float, faste
 
 
 def _match_tracks(tracks: ShortTracks, other: ListPoints, offset_s: float) -> tuple[Int, Int]:
-    """(K,) rows of `other` whose track is nearly always nearest to one of `tracks`, and that track of each row."""
-    near, state, _ = tracks.nearest(other, offset_s, gate_m=GATE_M, faster_mps=-1.0, mutual=True)
-    pair, count = np.unique(np.stack([state.track, other.track[near]]), axis=1, return_counts=True)
-    edge = [np.searchsorted(tracks.track, pair[0], side=side) for side in ("left", "right")]
-    from_s, to_s = tracks.time_s[edge[0]] + offset_s, tracks.time_s[edge[1] - 1] + offset_s
+    """(K,) rows of `other` whose track is nearly always nearest to one track of `tracks`, and (K,) that track."""
+    near_row, state, _ = tracks.nearest(other, offset_s, gate_m=GATE_M, faster_mps=-1.0, mutual=True)
+    pair, count = np.unique(np.stack([state.track, other.track[near_row]]), axis=1, return_counts=True)
+    track_edges = [np.searchsorted(tracks.track, pair[0], side=side) for side in ("left", "right")]
+    from_s, to_s = tracks.time_s[track_edges[0]] + offset_s, tracks.time_s[track_edges[1] - 1] + offset_s
     begin, end = (np.searchsorted(other.track, pair[1], side=side) for side in ("left", "right"))
     rows, matched = [], []
     for k in range(len(count)):
-        during = np.searchsorted(other.time_s[begin[k] : end[k]], [from_s[k], to_s[k]])
-        if count[k] >= max(NEARLY * (during[1] - during[0]), min(_MATCHES, end[k] - begin[k])):
+        rows_during = np.searchsorted(other.time_s[begin[k] : end[k]], [from_s[k], to_s[k]])
+        if count[k] >= max(NEARLY * (rows_during[1] - rows_during[0]), min(_MATCHES, end[k] - begin[k])):
             rows.append(np.arange(begin[k], end[k]))
             matched.append(np.full(end[k] - begin[k], pair[0, k]))
     empty = np.empty(0, dtype=np.int64)
@@ -382,7 +385,7 @@ def _match_tracks(tracks: ShortTracks, other: ListPoints, offset_s: float) -> tu
 
 
 def _state_estimate(fit: _Fit, *, unbiased: bool = False) -> TimeOffset:
-    """The estimate with its interval and drift; `untold` where blocks are too few or the interval is too wide."""
+    """The offset (s) with interval and drift; `untold` says why not: too few blocks, or the interval is too wide."""
     if fit.blocks < _FEWEST_BLOCKS:
         return TimeOffset(untold="too short a time with moving objects in both")
     pieces, offset_s = fit.ways.pieces, fit.ways.offset_s
@@ -394,8 +397,8 @@ def _state_estimate(fit: _Fit, *, unbiased: bool = False) -> TimeOffset:
     if np.ptp(pieces.time_s) < DRIFT_FROM_S:
         return estimate
     drifting = _Fit(pieces, offset_s, biased=fit.ways.biased, drift=True)
-    drift, half = float(drifting.ways.solved[-1]), drifting.half_width(-1)
-    return replace(estimate, drift=(drift, drift - half, drift + half))
+    drift, half_drift = float(drifting.ways.solved[-1]), drifting.half_width(-1)
+    return replace(estimate, drift=(drift, drift - half_drift, drift + half_drift))
 
 
 def _score_offset(tracks: ShortTracks, other: ListPoints, offset_s: float) -> float:
@@ -461,17 +464,17 @@ def _number_blocks(pieces: TrackPieces, long_s: float) -> Int:
 
 
 def _residual_correlation_s(pieces: TrackPieces, left_m: Float) -> float:
-    """Correlation time of errors, from residuals of one track about half a second apart; 0: hardly any."""
+    """Correlation time (s) of errors, from residuals `left_m` of one track about half a second apart; 0: hardly any."""
     rows = np.flatnonzero(pieces.other)
     time_s, track = pieces.time_s[rows], pieces.track[pieces.of[rows]]
     order = np.lexsort((time_s, track))
     time_s, track, left_m = time_s[order], track[order], np.clip(left_m[rows[order]], -GATE_M, GATE_M)
     axis = time_s + track * (np.ptp(time_s) + 10)
-    later = np.searchsorted(axis, axis + 0.5)
-    pair = np.flatnonzero(later < len(axis))
-    pair = pair[axis[later[pair]] - axis[pair] < 0.8]
+    later_row = np.searchsorted(axis, axis + 0.5)
+    pair = np.flatnonzero(later_row < len(axis))
+    pair = pair[axis[later_row[pair]] - axis[pair] < 0.8]
     if len(pair) < FEWEST:
         return 0.0
-    lag_s = float(np.mean(axis[later[pair]] - axis[pair]))
-    correlation = float(np.mean(left_m[pair] * left_m[later[pair]]) / np.mean(left_m**2))
+    lag_s = float(np.mean(axis[later_row[pair]] - axis[pair]))
+    correlation = float(np.mean(left_m[pair] * left_m[later_row[pair]]) / np.mean(left_m**2))
     return 0.0 if correlation < 0.05 else lag_s / -np.log(min(correlation, 0.95))

@@ -68,22 +68,22 @@ class PoseTrack:
     max_gap_s: float = MAX_GAP_S  # nothing is interpolated over a longer gap
 
     def at(self, stamp_ns: Int, *, forever: bool = False) -> SampledPoses:
-        """The pose at instants (K,); `forever`: the last sample holds at all instants."""
+        """The poses at instants (K,), between samples; `there`: known then. `forever`: the last sample always holds."""
         if forever or len(self.stamp_ns) == 1:
             last = np.full(len(stamp_ns), len(self.stamp_ns) - 1)
             return SampledPoses(np.ones(len(stamp_ns), dtype=bool), self.position_m[last], self.rotation[last])
         after = np.searchsorted(self.stamp_ns, stamp_ns, side="left").clip(1, len(self.stamp_ns) - 1)
         before = after - 1
-        apart = self.stamp_ns[after] - self.stamp_ns[before]
-        share = ((stamp_ns - self.stamp_ns[before]) / apart)[:, None]
+        gap_ns = self.stamp_ns[after] - self.stamp_ns[before]
+        fraction = ((stamp_ns - self.stamp_ns[before]) / gap_ns)[:, None]
         exact = (stamp_ns == self.stamp_ns[before]) | (stamp_ns == self.stamp_ns[after])
-        covered = (share[:, 0] >= 0) & (share[:, 0] <= 1) & ((apart <= self.max_gap_s * 1e9) | exact)
+        covered = (fraction[:, 0] >= 0) & (fraction[:, 0] <= 1) & ((gap_ns <= self.max_gap_s * 1e9) | exact)
         a, b = self.rotation[before], self.rotation[after]
         b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
-        mixed = (1 - share) * a + share * b  # samples are near each other: on the short arc this is the rotation
+        mixed = (1 - fraction) * a + fraction * b  # samples are near each other: on the short arc this is the rotation
         return SampledPoses(
             covered,
-            (1 - share) * self.position_m[before] + share * self.position_m[after],
+            (1 - fraction) * self.position_m[before] + fraction * self.position_m[after],
             mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12),
         )
 
@@ -109,7 +109,7 @@ class FrameTree:
     max_gap_s: float = MAX_GAP_S
 
     def add(self, poses: Poses, *, static: bool = False) -> None:
-        """Add transforms; a frame that has a parent already keeps it. `static`: they hold for ever."""
+        """Add transforms by child frame; one that has a parent keeps it. `static`: they hold for ever."""
         children = np.array(poses.child, dtype=object)
         for child in dict.fromkeys(poses.child):
             if not child or child in self.pose_tracks:
@@ -138,29 +138,28 @@ class FrameTree:
         return chain[moving[-1] + 1] if moving else frame
 
     def place(self, frame: str, world: str, stamp_ns: Int) -> SampledPoses | None:
-        """The pose of `frame` in `world` at instants (K,); None: no transforms connect them."""
+        """The pose of `frame` in `world` at instants (K,) in ns; None: no transforms connect them."""
         up, down = self.chain(frame), self.chain(world)
         common = next((name for name in up if name in down), None)
         if common is None:
             return None
         placed, base = (self._climb(chain[: chain.index(common)], stamp_ns) for chain in (up, down))
-        turn = invert_rotation(base.rotation)
+        world_rotation = invert_rotation(base.rotation)
         return SampledPoses(
             placed.there & base.there,
-            rotate_vectors(turn, placed.position_m - base.position_m),
-            compose_rotations(turn, placed.rotation),
+            rotate_vectors(world_rotation, placed.position_m - base.position_m),
+            compose_rotations(world_rotation, placed.rotation),
         )
 
     def place_by_ego(self, frame: str, ego: PoseTrack, stamp_ns: Int) -> SampledPoses | None:
-        """The pose of `frame` in the frame of the course of an ego, which is none of the tree's; None: not known.
-
-        It is the outermost one, if the ego is there by both; else what `frame` is fixed in goes with the ego.
+        """The pose of `frame` in the frame of an ego's course, which is none of the tree's; None: not known. It is the
+        outermost frame if the ego is at one place by both; else what `frame` is fixed in goes with the ego.
         """
         chain, outer = self.chain(frame), self.world_of(frame)
         body = next((name for name in chain[:-1] if not self._stands(name)), chain[-1])
-        found = self.place(body, outer, ego.stamp_ns) if body in self.pose_tracks else None
-        if found is not None and found.there.any():
-            apart_m = np.hypot(*(found.position_m - ego.position_m)[found.there, :2].T)
+        body_poses = self.place(body, outer, ego.stamp_ns) if body in self.pose_tracks else None
+        if body_poses is not None and body_poses.there.any():
+            apart_m = np.hypot(*(body_poses.position_m - ego.position_m)[body_poses.there, :2].T)
             if apart_m.max() <= BODY_M:
                 return self.place(frame, outer, stamp_ns)
         carried = FrameTree(self.pose_tracks | {body: ego}, self.static - {body}, self.max_gap_s)
@@ -372,7 +371,7 @@ def read_log_context(log: Log, spec: EgoTopic | None, *, seek_ego: bool, max_gap
 
 
 def _keep_run(poses: Poses, window: Window | None) -> Poses:
-    """The poses without those of another run than that of the window: its margin reaches into the one before."""
+    """The poses without those of another run (of the clock) than the window's: its margin may reach into one."""
     if window is None:
         return poses
     same_run, frames = np.ones(len(poses.stamp_ns), dtype=bool), np.array(poses.child, dtype=object)

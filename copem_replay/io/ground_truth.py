@@ -126,7 +126,7 @@ def correct_velocities(
 def _derive_velocities(
     start: Int, moving: Bool, max_gap_s: float, time_s: Float, x_m: Float, y_m: Float, vx_mps: Float, vy_mps: Float
 ) -> tuple[Float, Float, Int]:
-    """Velocities of some tracks (P,), and how many are not given, 0, too fast, and without a neighbour."""
+    """Velocities (P,) in m/s, from positions where implausible; how many are unset, frozen, too fast or alone."""
     before, after = _find_neighbours(start, time_s, max_gap_s)
     dx, dy, apart_s = (a[after] - a[before] for a in (x_m, y_m, time_s))
     with_both = np.maximum(apart_s, np.finfo(float).tiny)  # lone rows: 0 / tiny = 0
@@ -310,7 +310,7 @@ def _build_tracks(
     max_gap_s: float,
     notes: list[str],
 ) -> Tracks:
-    """The truth of rows that are in order of tracks, velocities and heights corrected; `notes` gets the corrections."""
+    """The truth of rows sorted by track, velocities and heights corrected; `notes` gets the corrections."""
     number = len(scene.object_ids)
     start = np.concatenate([[0], np.cumsum(np.bincount(object_ix, minlength=number))])
     captured_s = ((stamp_ns - scene.t0_ns) * 1e-9).astype(np.float64)

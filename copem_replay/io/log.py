@@ -70,6 +70,7 @@ def unsupported_file_error(expected: str, path: Path, start: bytes) -> Recording
 
 
 def _describe_file(expected: str, path: Path, start: bytes) -> str:
+    """What a file is instead of the `expected` recording, and what to do; `start`: its first bytes."""
     if not start:
         return "the file is empty"
     if start.startswith(_LFS_POINTER):
@@ -86,18 +87,18 @@ def _describe_file(expected: str, path: Path, start: bytes) -> str:
 
 
 def _describe_content(path: Path, start: bytes) -> str:
-    """The begin of a file of unknown kind: the columns of a table, its first line, or its first bytes."""
+    """What a file of unknown kind begins with: columns of a table, its first line, or its first bytes."""
     try:
         text = start.decode("utf-8", errors="ignore" if len(start) == _LOOKED_AT else "strict")
     except UnicodeDecodeError:
         text = ""
-    line = text.strip().partition("\n")[0].strip()
-    whole = len(text.encode()) > len(start) - 4  # a character may be cut off at the end
-    if not line or not whole or not all(c.isprintable() or c in "\t\r\n" for c in text):
+    first_line = text.strip().partition("\n")[0].strip()
+    is_text = len(text.encode()) > len(start) - 4  # a character may be cut off at the end
+    if not first_line or not is_text or not all(c.isprintable() or c in "\t\r\n" for c in text):
         return f"a file whose first bytes are {start[:_SHOWN_BYTES].hex(' ')}"
     if path.suffix.lower() in (".csv", ".tsv"):
-        return f"a table with the columns {line}{_MADE}"
-    return f"text that begins with {line!r}{_MADE if path.suffix.lower() in _CONVERTED else ''}"
+        return f"a table with the columns {first_line}{_MADE}"
+    return f"text that begins with {first_line!r}{_MADE if path.suffix.lower() in _CONVERTED else ''}"
 
 
 # The log of an MCAP file.
@@ -186,7 +187,7 @@ class Log:
         return open_from_start(self.path, error.__cause__, self.channels).within(self.window)
 
     def _by_index(self, file: IO[bytes], spans: Mapping[int, Span]) -> Iterator[Message]:
-        """Messages in order of log time. Raises BrokenIndexError, also where their number is not the index's."""
+        """Messages by log time, from the index. Raises BrokenIndexError, also if there are not as many as promised."""
         promised = sum(c.messages for c in self.channels if c.number in spans)
         count = 0
         try:
@@ -344,6 +345,7 @@ def _ahead_ns(text: str) -> int:
 
 
 def _make_channel(number: int, channel: Any, schema: Any, messages: int, expected: int | None = None) -> Channel:
+    """A channel from its MCAP records (`schema` None: it has none); `messages`: read, `expected`: by the index."""
     return Channel(
         number=number,
         topic=channel.topic,

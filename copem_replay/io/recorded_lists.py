@@ -100,7 +100,7 @@ class _ListTimes:
 
 
 def _settle_times(rows: _EntryRows, findings: list[str]) -> _ListTimes:
-    """The times of the lists, those that are not set replaced by the time of logging."""
+    """Captures and arrivals of the lists; those that are not set are replaced by the time of logging."""
     logged_ns, ahead_ns = np.array(rows.logged, dtype=np.int64), np.array(rows.ahead, dtype=np.int64)
     findings += find("stamp impossible", rows.impossible)
     settled = list[tuple[Int, Bool]]()
@@ -187,7 +187,7 @@ class _Entries:
 def _make_recorded(
     entries: _Entries, times: _ListTimes, path: Path, topic: str, scene: Scene, findings: list[str]
 ) -> RecordedLists:
-    """The lists as tracks, with what is none left out or completed, which `findings` get. Raises RecordingError."""
+    """The lists as tracks; `findings` get what is left out or completed. Raises RecordingError: a second run."""
 
     def list_contents() -> list[bytes]:
         ends = np.searchsorted(entries.frame, np.arange(1, len(times.logged_ns)))
@@ -235,7 +235,7 @@ def _no_lists_message(log: Log, topic: str) -> str:
 
 
 def _read_messages(log: Log, topic: str) -> _EntryRows:
-    """As `_read_rows`, from an opened log. Raises RecordingError, BrokenIndexError."""
+    """The entries on a topic of osi3.SensorData, from an opened log. Raises RecordingError, BrokenIndexError."""
     list_channels = {c.number: c for c in log.channels if c.topic == topic and c.schema == SENSOR_DATA}
     if not list_channels:
         raise RecordingError(_no_lists_message(log, topic), path=log.path)
@@ -268,7 +268,7 @@ def _read_messages(log: Log, topic: str) -> _EntryRows:
 
 
 def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int) -> None:
-    """Append one osi3.SensorData and its entries."""
+    """Append one osi3.SensorData and its entries to `rows`; `ahead_ns`: how far its clock is ahead."""
     frame = len(rows.logged)
     rows.logged.append(min(log_time_ns, LAST_NS))
     rows.ahead.append(ahead_ns)
@@ -277,26 +277,26 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
         times.append(osi.osi_stamp_ns(getattr(message, name)) if message.HasField(name) else None)
         rows.impossible += message.HasField(name) and times[-1] is None
     for item in [*message.moving_object, *message.stationary_object]:
-        base, spread = item.base, item.base_rmse
-        place, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
+        base, base_rmse = item.base, item.base_rmse
+        position, size, speed = base.position, base.dimension, getattr(base, "velocity", None)
         rows.frame.append(frame)
         truth_ids = item.header.ground_truth_id
         rows.ident.append(truth_ids[0].value if truth_ids else -1)
         tracked = item.header.HasField("tracking_id")
         rows.track.append(item.header.tracking_id.value & _LARGEST_ID if tracked else -1)
-        at = (place.x, place.y, place.z, base.orientation.yaw)
-        state, rules = osi.check_zeros(base, at if speed is None else (*at, speed.x, speed.y))
+        pose = (position.x, position.y, position.z, base.orientation.yaw)
+        state, rules = osi.check_zeros(base, pose if speed is None else (*pose, speed.x, speed.y))
         rows.rules.update(rules)
         x, y, z, yaw, vx, vy = _transform_entry(message, *state, *((0.0, 0.0) if speed is None else ()))
         rows.values.append((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
-        stated = [(spread.orientation, "yaw"), (spread.dimension, "length")]
-        stated += [(spread.velocity, "x")] if speed is not None else []
+        stated = [(base_rmse.orientation, "yaw"), (base_rmse.dimension, "length")]
+        stated += [(base_rmse.velocity, "x")] if speed is not None else []
         deviations = [getattr(of, name) if of.HasField(name) else np.nan for of, name in stated]
         deviations += [0.0] if speed is None else []
-        has_spread = spread.position.HasField("x") and spread.position.HasField("y")
-        along, across = (each * each if has_spread else 0.0 for each in (spread.position.x, spread.position.y))
-        turn = _frame_yaw(message)
-        cos, sin = np.cos(turn), np.sin(turn)
+        has_spread = base_rmse.position.HasField("x") and base_rmse.position.HasField("y")
+        along, across = (each * each if has_spread else 0.0 for each in (base_rmse.position.x, base_rmse.position.y))
+        yaw_rad = _frame_yaw(message)
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         rows.variances.append(
             (
                 float(cos * cos * along + sin * sin * across),
@@ -312,23 +312,23 @@ def _add_message(rows: _EntryRows, message: Any, log_time_ns: int, ahead_ns: int
 
 
 def _class_probabilities(item: Any, rows: _EntryRows) -> dict[int, float]:
-    """Probability by index of class, as the unit states it for a moving object; empty for a stationary one."""
+    """By index of class the probability that the unit states for a moving object; empty: a stationary one."""
     probability: dict[int, float] = {}
     for candidate in getattr(item, "candidate", ()):
         if not hasattr(candidate, "vehicle_classification"):  # a stationary object's
             continue
         vehicle = candidate.vehicle_classification if candidate.HasField("vehicle_classification") else None
-        kind = osi.osi_class_index(candidate.type, None if vehicle is None else vehicle.type)
-        saying = [candidate, *([vehicle] if kind == osi.VEHICLE and vehicle is not None else [])]
-        rows.rules["class unsaid"] += not all(of.HasField("type") for of in saying)
-        stated = candidate.HasField("probability")
-        share = candidate.probability if stated else 1.0
-        if not stated and any(other.HasField("probability") for other in item.candidate):
+        class_ix = osi.osi_class_index(candidate.type, None if vehicle is None else vehicle.type)
+        messages = [candidate, *([vehicle] if class_ix == osi.VEHICLE and vehicle is not None else [])]
+        rows.rules["class unsaid"] += not all(of.HasField("type") for of in messages)
+        has_probability = candidate.HasField("probability")
+        share = candidate.probability if has_probability else 1.0
+        if not has_probability and any(other.HasField("probability") for other in item.candidate):
             rows.rules["class share"] += 1
         if not 0.0 <= share <= MOST_SHARE:
             rows.rules["class share"] += 1
             share = 0.0
-        probability[kind] = probability.get(kind, 0.0) + share
+        probability[class_ix] = probability.get(class_ix, 0.0) + share
     return probability
 
 
@@ -342,7 +342,7 @@ def _frame_yaw(message: Any) -> float:
 def _transform_entry(
     message: Any, x: float, y: float, z: float, yaw: float, vx: float, vy: float
 ) -> tuple[float, float, float, float, float, float]:
-    """A state in the world: transformed from the virtual sensor's frame, or as it is without a host location."""
+    """A state in the world, from the virtual sensor's frame; unchanged without a host location."""
     if not message.HasField("host_vehicle_location"):
         return x, y, z, yaw, vx, vy
     for frame in (message.mounting_position, message.host_vehicle_location):
@@ -357,7 +357,7 @@ def _transform_entry(
 
 
 def _make_tracks(rows: _EntryRows, topic: str, scene: Scene) -> Tracks:
-    """Tracks by object of `scene` and track id."""
+    """The entries as tracks, one for each true object of `scene` and track id."""
     stamps = _settle_times(rows, []).stamps_ns
     by_time, frame = order_by_time(stamps[:, 1], np.array(rows.frame, dtype=np.int64))
     object_by_id = {osi_id(name): k for k, name in enumerate(scene.object_ids)}
@@ -423,6 +423,7 @@ def read_described_lists(
 
 
 def _read_described(log: Log, topic: str, scene: Scene, context: LogContext | None) -> RecordedLists | None:
+    """The lists on a topic of any schema but OSI's; None: no such topic. Raises RecordingError."""
     channels = [c for c in known_lists(log.channels) if c.topic == topic]
     if not channels:
         return None
@@ -441,7 +442,7 @@ def _read_described(log: Log, topic: str, scene: Scene, context: LogContext | No
 
 
 def _read_details(log: Log, topic: str) -> dict[int, dict[str, Any]]:
-    """The content of the topic `…/detail` beside a topic, by the time in ns at which each list was available."""
+    """By time available (ns) the content of `…/detail` beside a topic, as this package writes it."""
     beside = f"{topic.removesuffix('/objects')}/detail"
     channels = [c for c in log.channels if c.topic == beside and c.messages and schema_name(c) == STRING]
     details: dict[int, dict[str, Any]] = {}
@@ -471,7 +472,7 @@ def _find_captures(stamps: Int, details: Details) -> tuple[Int, Bool]:
 
 
 def _add_details(lists: DecodedLists, details: Details) -> tuple[DecodedLists, Float]:
-    """The lists with sizes and existence of `details`, and (P, uncertainties) their variances, NaN: not stated."""
+    """The lists with sizes and existence of `details`, and (P, uncertainties) variances; NaN: not stated."""
     columns = lists.columns
     values, existence = columns.values.copy(), lists.existence.copy()
     variances = np.full((len(values), len(UNCERTAINTIES)), np.nan)
@@ -496,12 +497,12 @@ def _get_number(item: Any, name: str, otherwise: float) -> float:
 def _make_recorded_lists(
     lists: DecodedLists, captures: tuple[Int, Bool], details: Details, path: Path, topic: str, scene: Scene
 ) -> RecordedLists:
-    """The lists as tracks, with their captures, and whether these are stated."""
+    """The lists as tracks; `captures`: time of each list (ns), and whether it is stated."""
     captured, capture_said = captures
     lists, variances = _add_details(lists, details)
     columns, findings = lists.columns, list[str]()
-    turned = ~np.isnan(lists.covariance_m2).all(axis=1)
-    variances[:, :3] = np.where(np.asarray(turned)[:, None], lists.covariance_m2, 0.0)  # turned with its list
+    has_covariance = ~np.isnan(lists.covariance_m2).all(axis=1)
+    variances[:, :3] = np.where(np.asarray(has_covariance)[:, None], lists.covariance_m2, 0.0)  # turned with its list
     entries = _Entries(
         np.repeat(np.arange(len(columns.rows)), columns.rows),
         columns.values,
@@ -513,5 +514,5 @@ def _make_recorded_lists(
     times = _ListTimes(
         np.stack([captured, columns.stamp_ns], axis=1), capture_said, columns.stamped, columns.log_time_ns
     )
-    made = _make_recorded(entries, times, path, topic, scene, findings)
-    return replace(made, notes=(*(n for n in columns.notes if isinstance(n, Finding)), *made.notes))
+    recorded = _make_recorded(entries, times, path, topic, scene, findings)
+    return replace(recorded, notes=(*(n for n in columns.notes if isinstance(n, Finding)), *recorded.notes))

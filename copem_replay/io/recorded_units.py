@@ -87,7 +87,7 @@ def describe_oddities(lists: RecordedLists, object_ix: Int, scene: Scene) -> Ite
 
 
 def _changing_ids(lists: RecordedLists, object_ix: Int, scene: Scene) -> Iterator[str]:
-    """A line for the object whose id changes most often, if that is often."""
+    """A line on the object whose id changes most often, if that is more than `CHANGES_PER_MIN`; else none."""
     rows = np.flatnonzero((object_ix >= 0) & (lists.track_id >= 0))
     time_s = lists.tracks.row_captured_s
     order = rows[np.lexsort((time_s[rows], object_ix[rows]))]
@@ -219,9 +219,8 @@ def read_recorded_unit(
 
 
 def _covariance_columns(lists: RecordedLists, config: RecordedTopic, path: Path) -> dict[str, Any]:
-    """The columns of covariance with that of the experiment where a list states none; empty: it gives none.
-
-    Raises RecordingError: a list states none, and the experiment gives none.
+    """Columns of covariance (m²), with the experiment's where an entry states none; empty: nothing to fill in. Raises
+    RecordingError: an entry states none, and the experiment gives none.
     """
     unstated = ~lists.spread_said
     if config.covariance_m2 is None:

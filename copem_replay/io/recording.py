@@ -174,6 +174,7 @@ def _read(
     max_gap_s: float,
     classes: Mapping[str, str],
 ) -> Recording:
+    """The recording of a log: truth, scene, ego and notes, within the window. Raises RecordingError."""
     ego_spec = None if isinstance(ego, str) else ego
     topic, ignored = choose_topic(log, topic, unit_topics, fields, ego_spec)
 
@@ -195,10 +196,10 @@ def _read(
         why = "".join(f"; {note}" for note in ([damage] if damage else []) + notes)
         raise RecordingError(f"no usable object in {inside}{why}", path=log.path, topic=topic)
     host, host_notes = _find_host(columns.hosts)
-    if apart := _find_apart(context, truth):
+    if apart_notes := _find_apart(context, truth):
         if ego_spec is not None:
-            raise EgoError(f"{apart[0]}; `ego: none` replays without it", path=log.path)
-        host, host_notes = None, apart
+            raise EgoError(f"{apart_notes[0]}; `ego: none` replays without it", path=log.path)
+        host, host_notes = None, apart_notes
     ego_ix, ego_notes = _find_ego(log.path, scene, ego if isinstance(ego, str) else None, host)
     damage = _describe_damage(log, topic, scene.end_s)
     window_lines = window_notes(window_s)
@@ -317,15 +318,15 @@ def _describe_ignored(
     """Notes on topics and messages that are not read; `poses_read`: whether poses are."""
     notes = [f"topic {t} ({schema}) not read: {truth_topic} taken" for t, schema in topics.items() if t != truth_topic]
     skipped = Counter[str]()
-    poses: set[int] = set()
+    pose_channels: set[int] = set()
     if poses_read and (others := foreign_channels(log)):
-        poses = {c.number for c in others if is_pose(c)}
+        pose_channels = {c.number for c in others if is_pose(c)}
     for channel in log.channels:
-        has_messages = channel.messages and channel.number not in poses
+        has_messages = channel.messages and channel.number not in pose_channels
         # A topic of the truth may hold messages of another schema, too.
         of_topic = is_truth(channel) or channel.schema == topics.get(channel.topic)
-        beside_it = channel.topic in unit_topics or channel.schema == osi.EMBEDDED_MAP
-        if has_messages and not (channel.topic in topics and of_topic) and not beside_it:
+        is_read_otherwise = channel.topic in unit_topics or channel.schema == osi.EMBEDDED_MAP
+        if has_messages and not (channel.topic in topics and of_topic) and not is_read_otherwise:
             skipped[channel.schema or f"no schema ({channel.encoding})"] += channel.messages
     return notes + [f"{count_noun(number, 'message')} of {schema} not read" for schema, number in skipped.items()]
 
@@ -340,8 +341,7 @@ def _decode_world(
     seek_ego: bool,
     max_gap_s: float,
 ) -> tuple[DecodedObjects, LogContext | None, str]:
-    """The objects on a topic and the ego in the world, the frames of the log, and the name of the world's frame.
-
+    """The truth's objects and the ego in the world, the log's frames (None: OSI), and the name of the world's frame.
     Raises RecordingError, BrokenIndexError.
     """
     channels = [c for c in log.channels if c.topic == topic and c.messages]
@@ -383,7 +383,7 @@ def _add_notes(columns: DecodedObjects, around: LogContext) -> DecodedObjects:
 
 
 def _decode_topic(log: Log, topic: str) -> DecodedObjects:
-    """All messages of the truth on a topic. Raises RecordingError, BrokenIndexError."""
+    """The objects in all messages of the truth on a topic. Raises RecordingError, BrokenIndexError."""
     channels = {c.number: c for c in log.channels if c.topic == topic and is_truth(c)}
     decoder = osi.GroundTruthDecoder(DecodeAllowance(log.file_bytes()))
     try:
@@ -399,15 +399,14 @@ def _decode_topic(log: Log, topic: str) -> DecodedObjects:
 
 
 def _find_earlier(log: Log, channels: Mapping[int, Channel]) -> Iterator[tuple[int, bytes]]:
-    """Channel number and payload of messages before the window: simulators write the road, and what stands, once.
-
-    Those after the first are read where the window begins without things that stand, as far as they can be.
+    """Channel number and payload of messages before the window that tell of the road and of what stands: simulators
+    send these once. After the first, only until the window's first message repeats them.
     """
     if log.window is None or log.window.from_ns <= 0:
         return
     numbers, before = frozenset(channels), log.within(Window(to_ns=log.window.from_ns - 1))
-    begins = next(log.payloads(numbers), None)
-    all_sent = begins is not None and osi.sends_standing(begins[2], channels[begins[0]].schema)
+    first_inside = next(log.payloads(numbers), None)
+    all_sent = first_inside is not None and osi.sends_standing(first_inside[2], channels[first_inside[0]].schema)
     try:
         for number, _, payload in before.payloads(numbers):
             yield number, payload
@@ -418,7 +417,7 @@ def _find_earlier(log: Log, channels: Mapping[int, Channel]) -> Iterator[tuple[i
 
 
 def _describe_damage(log: Log, topic: str, end_s: float | None) -> str | None:
-    """What is wrong with the file, and how far it could be read; None: nothing."""
+    """A phrase on what is wrong with the file and how far it could be read (to `end_s`); None: nothing."""
     if log.damage is None:
         return None
     if log.complete:

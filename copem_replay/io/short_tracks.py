@@ -81,36 +81,35 @@ class ShortTracks:
     entries: ListPoints  # the entries that were smoothed, in order of tracks and time; `track` numbers the tracks
 
     def at(self, times_s: Float) -> tuple[PointStates, Int]:
-        """(K,) states of all tracks that have one at the ascending instants (F,), and the index of its instant."""
+        """(K,) states of all tracks that have one at ascending instants (F,) in s, and (K,) index of the instant."""
         span = float(max(self.time_s.max(), times_s.max()) - min(self.time_s.min(), times_s.min())) + 10
         begin = np.flatnonzero(np.diff(self.track, prepend=-1))
         first, last = self.time_s[begin], self.time_s[np.append(begin[1:], len(self.track)) - 1]
-        low, high = np.searchsorted(times_s, first), np.searchsorted(times_s, last, side="right")
-        count = np.maximum(high - low, 0)
+        first_instant, after_instant = np.searchsorted(times_s, first), np.searchsorted(times_s, last, side="right")
+        count = np.maximum(after_instant - first_instant, 0)
         track = np.repeat(np.arange(len(begin)), count)
-        instant = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+        instant = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first_instant, count)
         axis = self.time_s + np.repeat(np.arange(len(begin)), np.diff(np.append(begin, len(self.track)))) * span
         before = np.searchsorted(axis, times_s[instant] + track * span, side="right") - 1
         before = np.clip(before, begin[track], len(axis) - 1)
         after = np.minimum(before + 1, np.append(begin[1:], len(axis))[track] - 1)
         long_s = self.time_s[after] - self.time_s[before]
-        near = long_s <= self.gap_s
+        is_close = long_s <= self.gap_s
         weight = (times_s[instant] - self.time_s[before]) / np.maximum(long_s, 1e-9)
-        before, after, weight = before[near], after[near], np.clip(weight[near], 0.0, 1.0)
+        before, after, weight = before[is_close], after[is_close], np.clip(weight[is_close], 0.0, 1.0)
 
         def between(values: Float) -> Float:
             mixed: Float = values[..., before] * (1 - weight) + values[..., after] * weight
             return mixed
 
         states = PointStates(between(self.x_m), between(self.y_m), between(self.velocity), self.track[before])
-        return states, instant[near]
+        return states, instant[is_close]
 
     def nearest(
         self, other: ListPoints, offset_s: float, *, gate_m: float, faster_mps: float, mutual: bool = False
     ) -> tuple[Int, PointStates, Float]:
         """Entries nearest to a moving track once shifted back by `offset_s`: rows, states, distances in m, (K,) each.
-
-        Only tracks faster than `faster_mps` count. `mutual`: the entry is the nearest to that state, too.
+        Only tracks faster than `faster_mps` count. `mutual`: the entry is also nearest to that state.
         """
         stamps_s, instant_ix = np.unique(other.time_s, return_inverse=True)
         states, instant = self.at(stamps_s - offset_s)
@@ -123,13 +122,13 @@ class ShortTracks:
             return empty, _take_states(states, empty), np.empty(0)
         from scipy.spatial import cKDTree  # it takes long to import
 
-        away_m, point = cKDTree(points).query(entries, distance_upper_bound=gate_m)
-        rows = np.flatnonzero(np.isfinite(away_m))
+        distance_m, point = cKDTree(points).query(entries, distance_upper_bound=gate_m)
+        rows = np.flatnonzero(np.isfinite(distance_m))
         if mutual and len(rows):
             _, nearest_row = cKDTree(entries).query(points[point[rows]], distance_upper_bound=gate_m)
             rows = rows[nearest_row == rows]
         rows = rows[np.isin(point[rows], moving)]
-        return rows, _take_states(states, point[rows]), away_m[rows]
+        return rows, _take_states(states, point[rows]), distance_m[rows]
 
 
 def _take_states(states: PointStates, rows: Int) -> PointStates:
@@ -165,16 +164,16 @@ def _step_s(entries: ListPoints) -> float:
 
 
 def _smooth_points(entries: ListPoints, window_s: float, gap_s: float) -> ShortTracks:
-    """States of parabolas through the entries within `window_s`, where both sides have enough of them."""
+    """States from parabolas through the entries within `window_s`, where both sides have enough of them."""
     time_s, track = entries.time_s, entries.track
     if not len(time_s):
         return ShortTracks(time_s, track, entries.x_m, entries.y_m, np.empty((2, 0)), gap_s, entries)
     axis = time_s + track * (float(np.ptp(time_s)) + 10 * window_s)
     low, high = np.searchsorted(axis, axis - window_s), np.searchsorted(axis, axis + window_s, side="right")
-    here = np.arange(len(axis))
-    centres = np.flatnonzero((here - low >= _EACH_SIDE) & (high - here > _EACH_SIDE))
+    row_ix = np.arange(len(axis))
+    centres = np.flatnonzero((row_ix - low >= _EACH_SIDE) & (high - row_ix > _EACH_SIDE))
     sums = [np.zeros(len(centres)) for _ in range(5)]
-    right = np.zeros((2, 3, len(centres)))
+    right_sides = np.zeros((2, 3, len(centres)))
     widest = int((high - low)[centres].max()) if len(centres) else 0
     for n in range(widest):
         row = low[centres] + n
@@ -184,13 +183,13 @@ def _smooth_points(entries: ListPoints, window_s: float, gap_s: float) -> ShortT
         for power in range(5):
             sums[power] += np.where(in_window, t**power, 0.0)
         for axis_ix, values in enumerate((entries.x_m, entries.y_m)):
-            away = np.where(in_window, values[row] - values[centres], 0.0)  # small numbers keep their digits
+            offset_m = np.where(in_window, values[row] - values[centres], 0.0)  # small numbers keep their digits
             for power in range(3):
-                right[axis_ix, power] += away * t**power
+                right_sides[axis_ix, power] += offset_m * t**power
     normal = np.array([[sums[i + j] for j in range(3)] for i in range(3)]).transpose(2, 0, 1)
-    curved = np.linalg.det(normal) != 0  # no parabola goes through entries of one time alone
-    centres, normal, right = centres[curved], normal[curved], right[:, :, curved]
-    solved = np.linalg.solve(normal, right.transpose(2, 1, 0)) if len(centres) else np.empty((0, 3, 2))
+    is_solvable = np.linalg.det(normal) != 0  # no parabola goes through entries of one time alone
+    centres, normal, right_sides = centres[is_solvable], normal[is_solvable], right_sides[:, :, is_solvable]
+    solved = np.linalg.solve(normal, right_sides.transpose(2, 1, 0)) if len(centres) else np.empty((0, 3, 2))
     x_m, y_m = entries.x_m[centres] + solved[:, 0, 0], entries.y_m[centres] + solved[:, 0, 1]
     return ShortTracks(time_s[centres], track[centres], x_m, y_m, solved[:, 1].T, gap_s, entries)
 

@@ -56,7 +56,7 @@ def parse_nanoseconds(texts: Sequence[DistinctTexts], unit: str) -> tuple[Int, B
 
 
 def _parse_words(texts: DistinctTexts, unit: str) -> tuple[Int, Bool, Bool]:
-    """As `parse_nanoseconds`, of one column; which are impossible."""
+    """As `parse_nanoseconds`, of one column: (F,) ns, whether it is a time, whether it is an impossible one."""
     stamp_of_word, is_time = np.zeros(len(texts.words) + 1, dtype=np.int64), np.zeros(len(texts.words) + 1, dtype=bool)
     impossible = np.zeros(len(texts.words) + 1, dtype=bool)
     for k, word in enumerate(texts.words):
@@ -75,17 +75,17 @@ def _parse_words(texts: DistinctTexts, unit: str) -> tuple[Int, Bool, Bool]:
 
 
 def _parse_date(word: str) -> int | None:
-    """`2024-05-01T12:00:00.25+02:00` in ns of Unix time; None: no such text."""
-    found = _ISO.fullmatch(word.strip())
-    if found is None:
+    """`2024-05-01T12:00:00.25+02:00` in ns of Unix time; None: the text is no such date."""
+    date_match = _ISO.fullmatch(word.strip())
+    if date_match is None:
         return None
-    *parts, fraction, sign, hours, minutes = found.groups()
+    *parts, fraction, sign, hours, minutes = date_match.groups()
     try:
         since_epoch = datetime(*map(int, parts), tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]
     except ValueError:  # the 30th of February
         return None
-    ahead = timedelta(hours=int(hours or 0), minutes=int(minutes or 0))
-    since_epoch += ahead if sign == "-" else -ahead
+    zone_offset = timedelta(hours=int(hours or 0), minutes=int(minutes or 0))
+    since_epoch += zone_offset if sign == "-" else -zone_offset
     nanos = round(Decimal(f"0.{fraction or 0}") * 10**9)
     return (since_epoch.days * 86_400 + since_epoch.seconds) * 10**9 + nanos
 
@@ -134,24 +134,24 @@ def settle_stamps(
 
 
 def _find_unset(stamp_ns: Int, stamped: Bool, log_time_ns: Int, zero: Bool) -> Bool:
-    """(F,) which of the stated stamps are not set: several zeros, and those of another clock than their neighbours'."""
+    """(F,) stated stamps that are not set: zeros, if several, and those of another clock than their neighbours'."""
     unset = stamped & zero if (stamped & zero).sum() > 1 else np.zeros(len(stamp_ns), dtype=bool)
     rows = np.flatnonzero(stamped & ~unset)
     rows = rows[np.argsort(log_time_ns[rows], kind="stable")]
     if len(rows) > 2:
-        lone = _find_lone(stamp_ns[rows], log_time_ns[rows])
-        unset[rows[lone]] = True
-        rows = rows[~lone]
+        is_lone = _find_lone(stamp_ns[rows], log_time_ns[rows])
+        unset[rows[is_lone]] = True
+        rows = rows[~is_lone]
     leaps = np.flatnonzero(np.diff(stamp_ns[rows]) > np.diff(log_time_ns[rows]) + _LEAP_NS)
     if len(leaps):
         parts = np.split(rows, leaps + 1)
-        most = max(parts, key=len)
-        unset[np.setdiff1d(rows, most)] = True
+        largest_part = max(parts, key=len)
+        unset[np.setdiff1d(rows, largest_part)] = True
     return unset
 
 
 def _find_lone(stamp_ns: Int, log_time_ns: Int) -> Bool:
-    """(F,) which stamps, in order of logging, fit neither neighbour, though the neighbours fit each other."""
+    """(F,) stamps in order of logging that fit neither neighbour, though the neighbours fit each other."""
 
     def fits(step: int) -> Bool:
         apart_ns = stamp_ns[step:] - stamp_ns[:-step]

@@ -129,15 +129,15 @@ def _find_reuse(rows: TrackRows, apart_s: Float) -> Bool:
 
 
 def _join_pieces(rows: TrackRows, pieces: list[Int]) -> list[Int]:
-    """Pieces of a track, each with the later ones that continue it."""
+    """Pieces (rows) of a track, each joined with later ones that continue it at a plausible speed."""
     groups: list[Int] = []
     for piece in pieces:
         for k, group in enumerate(groups):
             last, first = group[-1], piece[0]
             apart_s = rows.time_s[first] - rows.time_s[last]
-            far = float(np.hypot(*(rows.values[first, :2] - rows.values[last, :2])))
-            lasting = _typical_mps(rows, group) + 0.5 * _HARDEST_MPS2 * min(apart_s, 1.0)
-            if AGREE[rows.class_ix[first], rows.class_ix[last]] and far <= _SLACK_M + lasting * apart_s:
+            distance_m = float(np.hypot(*(rows.values[first, :2] - rows.values[last, :2])))
+            speed_mps = _typical_mps(rows, group) + 0.5 * _HARDEST_MPS2 * min(apart_s, 1.0)
+            if AGREE[rows.class_ix[first], rows.class_ix[last]] and distance_m <= _SLACK_M + speed_mps * apart_s:
                 groups[k] = np.append(group, piece)
                 break
         else:
@@ -192,7 +192,7 @@ def _look_like_degrees(rows: TrackRows) -> bool:
 
 
 def _find_courses(rows: TrackRows) -> tuple[Float, Bool]:
-    """(P,) direction of the path, from the place before to the one after, and whether the object moves there."""
+    """(P,) direction (rad) of the path, from the place before to the one after; (P,) whether the object moves there."""
     same, apart_s = _steps(rows)
     joined = same & (apart_s <= 1.0)
     row = np.arange(len(rows.object_ix))
@@ -200,8 +200,8 @@ def _find_courses(rows: TrackRows) -> tuple[Float, Bool]:
     before[1:] -= joined
     after[:-1] += joined
     dx, dy = (rows.values[after, k] - rows.values[before, k] for k in (X, Y))
-    lasting = np.maximum(rows.time_s[after] - rows.time_s[before], 1e-9)
-    moves = (np.hypot(dx, dy) > _MOVING_MPS * lasting) & (np.hypot(dx, dy) > 0.1) & rows.moving[rows.object_ix]
+    duration_s = np.maximum(rows.time_s[after] - rows.time_s[before], 1e-9)
+    moves = (np.hypot(dx, dy) > _MOVING_MPS * duration_s) & (np.hypot(dx, dy) > 0.1) & rows.moving[rows.object_ix]
     return np.arctan2(dy, dx), moves
 
 

@@ -80,14 +80,15 @@ def first_listed_s(seen: Tracks, episodes: Episodes, units: Collection[str], *, 
 
 
 def _first_listed_s(perceived: Tracks, episodes: Episodes, units: Collection[str], *, count_earlier: bool) -> Float:
+    """(S, M) capture (s) of the first list of any of `units` that holds the object during its episode; NaN: none."""
     episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), perceived.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
     episode, captured_s = episode_of[perceived.row_object_ix], perceived.entry_captured_s
     in_units = np.array([name in units for name in perceived.units], dtype=bool)[perceived.row_unit_ix]
     rows = np.flatnonzero(in_units & (episode >= 0) & np.isfinite(perceived.common_arrives_s)[perceived.frame_ix])
-    during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
+    is_during = captured_s[rows] <= episodes.ended_s[episode[rows]] + SAME_INSTANT_S
     from_s = episodes.counts_from_s(count_earlier=count_earlier)
-    rows = rows[during & (captured_s[rows] >= from_s[episode[rows]])]
+    rows = rows[is_during & (captured_s[rows] >= from_s[episode[rows]])]
     first_s = np.full((len(perceived.valid), len(episodes.object_ix)), np.inf)
     for s, valid in enumerate(perceived.valid):
         listed = rows[valid[rows]]
@@ -201,8 +202,7 @@ def _configuration_columns(
     onset_m: Float,
     area: NDArray[np.object_] | None,
 ) -> dict[str, Any]:
-    """Columns (S · M,) of one configuration: whether, when and how far away each object is detected.
-
+    """Columns (S · M,) of one configuration: whether, when and how far away each object is detected in each run.
     `onset_m (M,)`: distances at the onset; `area (M,)`: the areas then, None: the study has none.
     """
     S, M = len(runs), len(episodes.object_ix)
@@ -239,12 +239,12 @@ def _configuration_columns(
     }
     if event.conflict_known_s is not None:
         conflict_known_s = flat(event.conflict_known_s)
-        away_m, _ = measure_distances(scene, truth, experiment, flat(episodes.object_ix), conflict_known_s)
+        conflict_distance_m, _ = measure_distances(scene, truth, experiment, flat(episodes.object_ix), conflict_known_s)
         columns |= {
             "conflict_detected": ~np.isnan(conflict_known_s),
             "conflict_detection_s": conflict_known_s,
             "time_to_conflict_detection_s": conflict_known_s - onset_s,
-            "distance_at_conflict_detection_m": away_m,
+            "distance_at_conflict_detection_m": conflict_distance_m,
         }
     return columns
 
@@ -272,7 +272,9 @@ def _braking_columns(
     delay_s: Float,
     event: DetectionEvents,
 ) -> dict[str, Any]:
-    """Columns (S · M,) of one configuration: the verdicts of the episodes in conflict; null for the others."""
+    """Columns (S · M,) of one configuration: braking and verdict of each episode in conflict; null for the others.
+    `delay_s (S, M)`: reaction of the driver.
+    """
     braking = experiment.braking
     assert braking is not None
     shape = delay_s.shape

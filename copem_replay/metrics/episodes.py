@@ -105,16 +105,15 @@ class Episodes:
 
     @cached_property
     def passes(self) -> tuple[tuple[Int, Episodes], ...]:
-        """Passes of at most one episode per object, each with its indices: all first episodes, all second ones, …
-
-        Code that looks up the episode of an object measures pass by pass; `join_passes` puts the columns together.
+        """Indices and episodes of each pass, which has at most one episode per object: all first ones, all second ones,
+        … Code that looks up an object's episode goes pass by pass; `join_passes` puts the columns together.
         """
         if not len(self.object_ix):
             return ((np.empty(0, dtype=np.int64), self),)
         first = np.flatnonzero(np.diff(self.object_ix, prepend=-1) != 0)
-        rank = np.arange(len(self.object_ix)) - np.repeat(first, np.diff(np.append(first, len(self.object_ix))))
-        each = (np.flatnonzero(rank == k) for k in range(int(rank.max()) + 1))
-        return tuple((which, self.take(which)) for which in each)
+        pass_number = np.arange(len(self.object_ix)) - np.repeat(first, np.diff(np.append(first, len(self.object_ix))))
+        each = (np.flatnonzero(pass_number == k) for k in range(int(pass_number.max()) + 1))
+        return tuple((episode_ix, self.take(episode_ix)) for episode_ix in each)
 
     def join_passes(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """(…, M) the columns of all episodes, from the columns of each pass (…, m)."""
@@ -124,12 +123,12 @@ class Episodes:
         return np.concatenate(parts, axis=-1)[..., order]
 
     def number_rows(self, tracks: Tracks) -> Int:
-        """(P,) the episode during which each row was captured; −1: none."""
+        """(P,) the number of the episode during which each row was captured; −1: none."""
         numbers, captured_s = np.full(len(tracks.frame_ix), -1), tracks.row_captured_s
         of_object = np.empty(int(max(self.object_ix.max(initial=-1), tracks.object_ix.max(initial=-1))) + 1, np.int64)
-        for which, one in self.passes:
+        for episode_ix, one_pass in self.passes:
             of_object[:] = -1
-            of_object[one.object_ix] = which
+            of_object[one_pass.object_ix] = episode_ix
             number = of_object[tracks.row_object_ix]
             rows = np.flatnonzero(number >= 0)
             number, at_s = number[rows], captured_s[rows]
@@ -238,30 +237,32 @@ def _begin_at(instant_s: float, world: Tracks, stay: _EgoStay) -> _Begun:
 def _begin_holding(
     world: Tracks, holding: Bool, possible: Bool, frames_s: Float, stay: _EgoStay, again_after_s: float | None
 ) -> _Begun:
-    """The episodes from rows (P,) at which the condition holds, and can be asked."""
+    """The episodes that begin at rows (P,) where the condition is `holding`; `possible`: where it can be evaluated.
+    `again_after_s`: how long an object must have been away to begin another episode; None: it never does.
+    """
     rows = np.flatnonzero(holding)
     track, time_s = world.track_ix[rows], world.row_captured_s[rows]
     first = np.diff(track, prepend=-1) != 0
     away_s = np.diff(time_s, prepend=-np.inf)
-    # Out: at some frame in between the condition does not hold, or the object is absent.
-    out = ~first & (np.diff(world.frame_ix[rows], prepend=-2) > 1)
-    returned = out & (away_s > (AGAIN_AFTER_S if again_after_s is None else again_after_s) + SAME_INSTANT_S)
+    # Away: at some frame in between the condition does not hold, or the object is absent.
+    was_away = ~first & (np.diff(world.frame_ix[rows], prepend=-2) > 1)
+    returned = was_away & (away_s > (AGAIN_AFTER_S if again_after_s is None else again_after_s) + SAME_INSTANT_S)
     begins = np.flatnonzero(first | returned if again_after_s is not None else first)
     onset_row, onset_first = rows[begins], first[begins]
     possible_from_s = frames_s[np.argmax(stay.there)] if stay.there.any() else np.inf
-    earlier, _ = _find_first_true(possible, world.start)
-    own_first = earlier[track[begins]] == onset_row
+    first_possible_row, _ = _find_first_true(possible, world.start)
+    own_first = first_possible_row[track[begins]] == onset_row
     # Who comes back crosses if it, and the ego, was there up to then, else it appears again.
-    followed = (onset_row > 0) & (world.frame_ix[onset_row] - world.frame_ix[onset_row - 1] == 1)
-    followed &= possible[onset_row - 1]
-    began = np.where(np.where(onset_first, own_first, ~followed), APPEARED, CROSSED)
+    was_seen_before = (onset_row > 0) & (world.frame_ix[onset_row] - world.frame_ix[onset_row - 1] == 1)
+    was_seen_before &= possible[onset_row - 1]
+    began = np.where(np.where(onset_first, own_first, ~was_seen_before), APPEARED, CROSSED)
     began = np.where(onset_first & own_first & (time_s[begins] <= possible_from_s + SAME_INSTANT_S), LOG_START, began)
     held_until_s = np.full(len(begins), np.inf)
     return_ix = np.flatnonzero(~onset_first)
     held_until_s[return_ix - 1] = time_s[begins[return_ix] - 1]
     held_row, ego_left = rows[begins[return_ix] - 1], np.zeros(len(begins), dtype=bool)
-    stays = world.frame_ix[held_row + 1] - world.frame_ix[held_row] == 1
-    ego_left[return_ix - 1] = stays & ~possible[held_row + 1]
+    is_still_there = world.frame_ix[held_row + 1] - world.frame_ix[held_row] == 1
+    ego_left[return_ix - 1] = is_still_there & ~possible[held_row + 1]
     count = np.append(0, np.cumsum(returned & ~np.isin(np.arange(len(rows)), begins)))
     returns = np.diff(count[np.append(begins, len(rows))])
     return _Begun(track[begins], time_s[begins], began, held_until_s, ego_left, returns)
@@ -312,11 +313,8 @@ def _measure_distance(scene: Scene, truth: Tracks, world: Tracks, experiment: Me
 def _find_best_share(
     scene: Scene, truth: Tracks, static: Statics, experiment: MetricsSetup, seen_by: Literal["ego", "any"]
 ) -> Float:
-    """(P,) the largest visible share any unit (of the ego) has of each row of the truth; 0 where there is none.
-
-    Of objects that are not measured it is 0.
-
-    Units that only some runs have do not count: an onset is the same in all of them.
+    """(P,) the largest visible share of each row of the truth for any unit (or those of the ego); 0: seen by none.
+    Objects that are not measured have 0. Units that only some runs have do not count: an onset is the same in all runs.
     """
     ego_carriers = {"ego", scene.object_ids[scene.ego_ix]} if scene.ego_ix >= 0 else set()
     units = {
@@ -326,12 +324,12 @@ def _find_best_share(
     }
     if not units:
         return np.zeros(len(truth.frame_ix))
-    places = [compute_unit_poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in units.items()]
+    unit_poses = [compute_unit_poses(scene, u, truth, unit_ground(truth, n, u)) for n, u in units.items()]
     measured = np.isin(truth.row_object_ix, measured_objects(scene, experiment.measure))
     shares = visible_shares(
         truth,
         static,
-        make_observers(places, np.array([find_carrier(scene, u) for u in units.values()])),
+        make_observers(unit_poses, np.array([find_carrier(scene, u) for u in units.values()])),
         experiment.visibility,
         np.tile(measured, (len(units), 1)),
     )

@@ -50,7 +50,7 @@ class LastingDetection:
         return LastingDetection(self.process[rows], self.share[rows], self.tau_s[rows], self.captured_s[rows])
 
     def log_missed(self, listed: Float, fresh: Float) -> Float:
-        """(P,) ln of the probability that each list misses the object, given that the earlier ones of its process do.
+        """(P,) ln of the probability that each list misses the object, given that its process's earlier lists miss it.
 
         `listed (P,)`: probability that the list holds the object; `fresh (P,)`: ln of the probability of a miss where
         the list has no process. Lists of a process arrive in the order of their captures.
@@ -113,18 +113,18 @@ class Sequences:
 
     @classmethod
     def of(cls, start: Int, listed: Float, held: Bool, captured_s: Float) -> Sequences:
-        """The series of lists (P,) that were captured at `captured_s (P,)`."""
+        """The series of lists (P,): probability `listed`, whether `held`, capture (s); series i from `start[i]` on."""
         number = np.repeat(np.arange(len(start) - 1), np.diff(start))
         ends = np.repeat(np.arange(len(start) - 1), 2)
         edges = np.concatenate([listed, np.tile([0.0, 1.0], len(start) - 1)])
         number = np.concatenate([number, ends])
         order = np.lexsort((edges, number))
         number, edges = number[order], edges[order]
-        new = np.r_[True, (np.diff(number) > 0) | (np.diff(edges) > 0)]
+        is_new = np.r_[True, (np.diff(number) > 0) | (np.diff(edges) > 0)]
         gap_s = np.diff(captured_s, prepend=captured_s[:1])
         gap_s[start[:-1]] = 0.0
-        bounds = np.searchsorted(number[new], np.arange(len(start)))
-        return cls(start, listed, np.ascontiguousarray(held), gap_s, edges[new], bounds)
+        bounds = np.searchsorted(number[is_new], np.arange(len(start)))
+        return cls(start, listed, np.ascontiguousarray(held), gap_s, edges[is_new], bounds)
 
     def log_probability(self, share: float, tau_s: float) -> Float:
         """(P,) ln of the probability of what each list shows, given the lists before it in its series."""
@@ -323,12 +323,11 @@ def _weigh_by_presence(step: Float, share: float) -> Float:
 def _run_chain(
     step: Float, listed: Float, gaps: Int, hits: int, window: int, probability: Float
 ) -> tuple[float, float]:
-    """A Markov chain whose state is which of the last `window` − 1 captures hold the object.
+    """The log of P(never confirmed) and its derivative by δ; fills `probability (K,)`, of confirmation at each instant.
 
-    `step (K,)`: ln of the probability that no list of the instant holds it; `listed (K,)`: the sum of their p;
-    `gaps (K,)`: captures without the object before the instant. Each state has the logarithm of its mass and its
-    derivative by δ; derivatives that meet in a state are weighted by their masses. Fills `probability (K,)` and returns
-    ln P(never) and its derivative.
+    A Markov chain over which of the last `window` − 1 captures hold the object. `step (K,)`: ln of the probability that
+    no list of the instant holds it; `listed (K,)`: the sum of their p; `gaps (K,)`: captures without the object before
+    it. Masses are logarithms; derivatives that meet in a state are weighted by them.
     """
     states = 1 << (window - 1)
     hits_in = np.zeros(states, dtype=np.int64)
@@ -336,44 +335,44 @@ def _run_chain(
         hits_in[state] = hits_in[state >> 1] + (state & 1)
     mass, slope = np.full(states, -np.inf), np.zeros(states)
     mass[0] = 0.0
-    known, known_slope = 0.0, 0.0
+    known_probability, known_slope = 0.0, 0.0
     for k in range(len(step)):
         for _ in range(gaps[k]):
             mass, slope = _advance_chain(mass, slope, hits_in, window + 1, 0.0, 0.0, -np.inf, 0.0)
         hit, hit_slope = -np.inf, 0.0
         if step[k] < 0:
             hit, hit_slope = np.log(-np.expm1(step[k])), listed[k] / np.expm1(-step[k])
-        new, new_slope = -np.inf, 0.0
+        new, confirmed_slope = -np.inf, 0.0
         for state in range(states):
             if hits_in[state] + 1 >= hits:
-                new, new_slope = _add_logs(new, new_slope, mass[state] + hit, slope[state] + hit_slope)
+                new, confirmed_slope = _add_logs(new, confirmed_slope, mass[state] + hit, slope[state] + hit_slope)
         probability[k] = np.exp(new)
-        known += probability[k]
-        known_slope += probability[k] * new_slope
+        known_probability += probability[k]
+        known_slope += probability[k] * confirmed_slope
         mass, slope = _advance_chain(mass, slope, hits_in, hits, step[k], -listed[k], hit, hit_slope)
-    if known < 0.5:  # then the rest is near 1, and its logarithm near 0
-        return np.log1p(-known), -known_slope / (1 - known)
-    rest, rest_slope = -np.inf, 0.0
+    if known_probability < 0.5:  # then the rest is near 1, and its logarithm near 0
+        return np.log1p(-known_probability), -known_slope / (1 - known_probability)
+    never_log, never_slope = -np.inf, 0.0
     for state in range(states):
-        rest, rest_slope = _add_logs(rest, rest_slope, mass[state], slope[state])
-    return rest, rest_slope
+        never_log, never_slope = _add_logs(never_log, never_slope, mass[state], slope[state])
+    return never_log, never_slope
 
 
 @callee
 def _advance_chain(
     mass: Float, slope: Float, hits_in: Int, hits: int, miss: float, miss_slope: float, hit: float, hit_slope: float
 ) -> tuple[Float, Float]:
-    """The chain one capture on: states that differ in the oldest capture only lead to one state by miss or hit."""
+    """The log masses and slopes (states,) one capture on: each state goes on by a miss, or a hit (below `hits`)."""
     states = len(mass)
     new, new_slope = np.full(states, -np.inf), np.zeros(states)
     for state in range(states):
-        after = (state << 1) & (states - 1)
-        new[after], new_slope[after] = _add_logs(
-            new[after], new_slope[after], mass[state] + miss, slope[state] + miss_slope
+        next_state = (state << 1) & (states - 1)
+        new[next_state], new_slope[next_state] = _add_logs(
+            new[next_state], new_slope[next_state], mass[state] + miss, slope[state] + miss_slope
         )
         if hits_in[state] + 1 < hits:
-            new[after | 1], new_slope[after | 1] = _add_logs(
-                new[after | 1], new_slope[after | 1], mass[state] + hit, slope[state] + hit_slope
+            new[next_state | 1], new_slope[next_state | 1] = _add_logs(
+                new[next_state | 1], new_slope[next_state | 1], mass[state] + hit, slope[state] + hit_slope
             )
     return new, new_slope
 

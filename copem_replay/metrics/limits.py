@@ -458,20 +458,20 @@ def limit_bounded_mean(
 
 
 def _weighted_at_random(points: Float, weights: Float, edge: Float, added: Float, q: float) -> Float:
-    """(…) the q-quantile of Σ E·w·z / Σ E·w with independent exponential E, over `points (…, K)` and the `edge`."""
+    """(…) the q-quantile of Σ E·w·z / Σ E·w: E exponential, independent; z and w of `points (…, K)` and `edge`."""
     from scipy.special import betaincinv
 
     z, w = np.concatenate([points, edge[..., None]], axis=-1), np.concatenate([weights, added[..., None]], axis=-1)
     u = w / w.sum(axis=-1, keepdims=True)
     mean = (u * z).sum(axis=-1)
     variance = ((u * (z - mean[..., None])) ** 2).sum(axis=-1) / (1.0 + (u**2).sum(axis=-1))
-    least, span = z.min(axis=-1), np.ptp(z, axis=-1)
-    flat = (span <= _ROUNDING) | (variance <= 0)
-    width = np.where(flat, 1.0, span)
-    p = np.clip((mean - least) / width, 1e-12, 1.0 - 1e-12)
-    size = np.maximum(p * (1.0 - p) * width**2 / np.where(flat, 1.0, variance) - 1.0, _ROUNDING)
-    found: Float = np.where(flat, mean, least + width * betaincinv(p * size, (1.0 - p) * size, q))
-    return found
+    lowest, span = z.min(axis=-1), np.ptp(z, axis=-1)
+    is_constant = (span <= _ROUNDING) | (variance <= 0)
+    width = np.where(is_constant, 1.0, span)
+    p = np.clip((mean - lowest) / width, 1e-12, 1.0 - 1e-12)
+    size = np.maximum(p * (1.0 - p) * width**2 / np.where(is_constant, 1.0, variance) - 1.0, _ROUNDING)
+    quantile: Float = np.where(is_constant, mean, lowest + width * betaincinv(p * size, (1.0 - p) * size, q))
+    return quantile
 
 
 @dataclass(frozen=True)

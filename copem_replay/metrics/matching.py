@@ -138,8 +138,9 @@ def _match_lists(
     start: Int, entries: Entries, origins: Origins, rows: _TruthRows, now: _TruthRows, agree: Bool, gate_m: float,
     matches: _MatchColumns, at_once: _MatchColumns, scratch: Int,
 ) -> None:  # fmt: skip
-    # `now`, `at_once`: truth and matches of the second question; those of the first one where there is no second.
-    # Of the list at hand: the frame each entry is compared with, and the entries that go through step 2.
+    """Fills `matches`, and `at_once` with those against the truth `now`, when the list is available (if it is another).
+    `agree (C, C)`: classes that may match; `scratch`: two rows, as long as the longest list.
+    """
     frame, contested = scratch[0], scratch[1]
     has_second = rows.by_frame != now.by_frame
     for s in range(len(start)):
@@ -192,6 +193,7 @@ def _match_list(
     gate_m: float,
     out: _MatchColumns,
 ) -> None:
+    """Fills `out` for the entries of one list, from `first` on; `frame`: the truth's frame of each (−1: none)."""
     bounds, row_object_ix, row_class_ix = rows.bounds, rows.object_ix, rows.class_ix
     row_x_m, row_y_m = rows.x_m, rows.y_m
     object_ix, role, class_ix, match_of = out.object_ix, out.role, out.class_ix, rows.match_of
@@ -249,29 +251,31 @@ def _find_nearest(
     class_ix: NDArray[np.int8], x_m: Float, y_m: Float, match_of: Int, only_free: bool, origins: Origins,
     list_key: tuple[int, int], i: int,
 ) -> int:  # fmt: skip
-    # The row, of first … high − 1, nearest to a place and within the gate (at a tie the western), of a class that
-    # agrees with the entry's and of an object that entry i of the list of a run may be about; −1: none.
-    least, best, west_m = gate_m * gate_m, -1, x - gate_m
-    remaining = high - first
-    while remaining > 0:  # the first row that is not too far west; without branches, which cannot be predicted
-        half = remaining >> 1
+    """The row in first … high − 1 nearest to (x, y) within the gate (at a tie the western), of a class that agrees and
+    an object that entry i of the list may be about; −1: none.
+    """
+    least_square, nearest_row, west_m = gate_m * gate_m, -1, x - gate_m
+    rows_left = high - first
+    while rows_left > 0:  # the first row that is not too far west; without branches, which cannot be predicted
+        half = rows_left >> 1
         too_far = x_m[first + half] < west_m
         first = first + half + 1 if too_far else first
-        remaining = remaining - half - 1 if too_far else half
+        rows_left = rows_left - half - 1 if too_far else half
     for p in range(first, high):
         if x_m[p] > x + gate_m:
             break
         if not agree[entry_class_ix, class_ix[p]] or (only_free and match_of[object_ix[p]] >= 0):
             continue
         square = (x_m[p] - x) ** 2 + (y_m[p] - y) ** 2
-        nearer = square < least or (square == least and best < 0)
+        nearer = square < least_square or (square == least_square and nearest_row < 0)
         if nearer and may_be_about(origins, list_key[0], list_key[1], i, object_ix[p]):
-            least, best = square, p
-    return best
+            least_square, nearest_row = square, p
+    return nearest_row
 
 
 @borrowing
 def _is_preferred(entries: Entries, i: int, j: int) -> bool:
+    """Whether entry i goes before j: higher existence, then newer, then more certain, then values that break ties."""
     a, b = entries[i], entries[j]
     if a.existence != b.existence:
         return bool(a.existence > b.existence)
@@ -314,7 +318,7 @@ def _find_original(entries: Entries, i: int, preferred: Int) -> int:
 
 @borrowing
 def _sort_by_preference(entries: Entries, rows: Int, n: int) -> None:
-    # Shell's sort with the gaps of Knuth, (3ʰ − 1) / 2.
+    """Sorts the first n `rows` in place, preferred entries first: Shell's sort with the gaps of Knuth, (3ʰ − 1) / 2."""
     gap = 1
     while gap < n:
         gap = 3 * gap + 1

@@ -55,24 +55,24 @@ class OriginLists:
     own_body_ix: int
 
     def find_holdings(self, issue_s: Float) -> Holdings:
-        """The objects that these lists hold, for fused lists available at `issue_s (K,)`."""
+        """Which objects each list holds, ready for look-up by fused lists that are available at `issue_s (K,)`."""
         lists, arrives_s = self.lists, self.lists.common_arrives_s
-        way_s = find_longest_way_s(lists)
+        longest_way_s = find_longest_way_s(lists)
         # Those before the first row, in a time chunk, hold nobody; where nothing is known of origin, each counts.
         unknown = self.goes_back == GoesBack.UNKNOWN
         since_s = -np.inf if unknown else self.rows.row_captured_s.min(initial=np.inf)
-        frame = np.flatnonzero(
+        frames = np.flatnonzero(
             (lists.captured_s >= since_s) & (arrives_s <= issue_s.max(initial=-np.inf) + SAME_INSTANT_S)
         )
-        frame = frame[np.lexsort((lists.captured_s[frame], lists.frame_unit_ix[frame]))]
-        start = np.searchsorted(lists.frame_unit_ix[frame], np.arange(len(lists.units) + 1))
+        frames = frames[np.lexsort((lists.captured_s[frames], lists.frame_unit_ix[frames]))]
+        start = np.searchsorted(lists.frame_unit_ix[frames], np.arange(len(lists.units) + 1))
         (row, first_row), units = self.rows.by_object, len(lists.units)
         return Holdings(
-            int(self.goes_back), self.partial, start, frame, arrives_s[frame], lists.captured_s[frame],
-            lists.frame_unit_ix[frame], self.rows.valid, row, self.rows.row_captured_s[row],
+            int(self.goes_back), self.partial, start, frames, arrives_s[frames], lists.captured_s[frames],
+            lists.frame_unit_ix[frames], self.rows.valid, row, self.rows.row_captured_s[row],
             self.rows.entry_captured_s[row], self.rows.frame_ix[row], first_row, (len(first_row) - 1) // max(units, 1),
-            self.own_body_ix, issue_s, self.max_age_s, way_s,
-            np.full((units, 2), np.nan), np.empty(units, np.int64), np.empty(len(frame), np.int64),
+            self.own_body_ix, issue_s, self.max_age_s, longest_way_s,
+            np.full((units, 2), np.nan), np.empty(units, np.int64), np.empty(len(frames), np.int64),
         )  # fmt: skip
 
 
@@ -135,12 +135,12 @@ class Origins(NamedTuple):
 
 @borrowing
 def _find_newest_list(h: Holdings, u: int, k: int, captured_s: float) -> int:
-    # The newest list of unit u, taken in by fused list k and captured by `captured_s`; start[u] − 1: none.
+    """The newest list of unit u that fused list k has taken in, captured by `captured_s`; start[u] − 1: none."""
     if h.asked[u, 0] != k or h.asked[u, 1] != captured_s:
-        first, after, until_s = h.start[u], h.start[u + 1], captured_s + SAME_INSTANT_S
+        first, after, latest_capture_s = h.start[u], h.start[u + 1], captured_s + SAME_INSTANT_S
         if h.goes_back == GoesBack.TO_ALL:
-            until_s = np.inf
-        a = first + count_below(h.captured_s[first:after], until_s) - 1
+            latest_capture_s = np.inf
+        a = first + count_below(h.captured_s[first:after], latest_capture_s) - 1
         while a >= first and h.arrives_s[a] > h.issue_s[k] + SAME_INSTANT_S:
             a -= 1
         h.asked[u, 0], h.asked[u, 1], h.newest[u] = k, captured_s, a
@@ -149,7 +149,7 @@ def _find_newest_list(h: Holdings, u: int, k: int, captured_s: float) -> int:
 
 @borrowing
 def _holds(h: Holdings, s: int, a: int, o: int, not_before_s: float) -> bool:
-    # Whether list a holds object o in run s, by an entry that was captured early enough.
+    """Whether list a holds object o in run s, by an entry captured at `not_before_s` or later."""
     if o + 1 >= h.objects or o == h.own_body_ix:
         return False
     group = h.unit_ix[a] * h.objects + o + 1

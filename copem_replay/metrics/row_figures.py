@@ -118,18 +118,18 @@ class FigureRows:
         return LimitedFigure(value, low, high, self.clusters.share_kind)
 
     def limit_mean_time(self, horizon_s: float, confidence: float) -> LimitedFigure:
-        """The restricted mean; without limits where no row is followed to its detection, departure or the horizon."""
-        value, over = restricted_mean(*self.curve, horizon_s), self.clusters
+        """The mean time to detection (s) up to the horizon; without limits where no row is followed to an ending."""
+        value, clusters = restricted_mean(*self.curve, horizon_s), self.clusters
         time_s, ending = self.endings
         followed = float(self.weight[(ending != CENSORED) | (time_s >= horizon_s - _SAME)].sum() / self.weight.sum())
-        if over is None or not followed:
+        if clusters is None or not followed:
             return LimitedFigure(value)
-        groups = int(over.group.max()) + 1
+        groups = int(clusters.group.max()) + 1
         bounds = float(time_s[self.known].min(initial=min(self.least_s, horizon_s))), horizon_s
-        without = restricted_means_without(
-            time_s, ending, self.weight, over.group, groups, horizon_s, least=self.least
+        means_without = restricted_means_without(
+            time_s, ending, self.weight, clusters.group, groups, horizon_s, least=self.least
         )  # fmt: skip
-        return self._limit_mean(over, value, without, bounds, confidence, followed)
+        return self._limit_mean(clusters, value, means_without, bounds, confidence, followed)
 
     def limit_mean(self, values: Float, most: float, confidence: float) -> LimitedFigure:
         """The mean of values (n,), each from 0 to `most`, with limits."""
@@ -151,7 +151,7 @@ class FigureRows:
         confidence: float,
         followed: float = 1.0,
     ) -> LimitedFigure:
-        """A mean between `bounds`, from those without each group of clusters."""
+        """A mean within `bounds`, with limits from the means `without` each group of clusters (jackknife)."""
         rows, groups = over.weigh(self.weight), np.bincount(over.group, self.weight).astype(float)
         unseen = None if over.by_run else float((rows**2).sum() / rows.sum()) / followed
         return limit_left_out(value, without, groups, bounds, confidence, unseen, over.count if over.by_run else 0)
@@ -161,18 +161,18 @@ class FigureRows:
         return {}
 
     def limit_time_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The time by which a share q is detected, with limits; ∞: fewer are ever detected."""
-        found = quantile_time(*self.curve, q)
-        value = math.inf if found is None else found
+        """The time (s) by which a share q is detected, with limits; ∞: fewer are. `bound` (s): also the share by it."""
+        time_s = quantile_time(*self.curve, q)
+        value = math.inf if time_s is None else time_s
         if self.clusters is None:
             return LimitedFigure(value)
         if confidence not in self._quantile_limits:
             self._quantile_limits[confidence] = self._limit_curve(confidence)
         times_s, low, high, steps = self._quantile_limits[confidence]
-        least, most = limit_quantile(np.append(-np.inf, times_s[steps]), low, high, q)
-        if math.isfinite(least) and (k := int(np.searchsorted(times_s[steps], least))) > 0:
-            least = float(times_s[steps[k - 1] + 1])  # between two instants limits are not known
-        return LimitedFigure(value, least, most, INVERTED, None if bound is None else self._share_by(bound, confidence))
+        low_s, most = limit_quantile(np.append(-np.inf, times_s[steps]), low, high, q)
+        if math.isfinite(low_s) and (k := int(np.searchsorted(times_s[steps], low_s))) > 0:
+            low_s = float(times_s[steps[k - 1] + 1])  # between two instants limits are not known
+        return LimitedFigure(value, low_s, most, INVERTED, None if bound is None else self._share_by(bound, confidence))
 
     def _share_by(self, at_s: float, confidence: float) -> tuple[float, float, float]:
         """The cumulative incidence at an instant between its limits."""
@@ -187,24 +187,24 @@ class FigureRows:
         return times_s, *self.limit_incidence(np.append(before, times_s[steps]), confidence), steps
 
     def limit_incidence(self, at_s: Sequence[float] | Float, confidence: float) -> tuple[Float, Float]:
-        """Lower and upper limits (G,) of the cumulative incidence at ascending instants (G,). Needs clusters."""
+        """Lower and upper limits (G,) of the share detected by ascending instants `at_s (G,)`. Needs clusters."""
         assert self.clusters is not None
         over, at_s, times_s = self.clusters, np.asarray(at_s, dtype=float), self.curve[0]
         share = np.append(0.0, self.curve[1])[np.searchsorted(times_s, at_s, side="right")]
         if over.by_run and over.units <= 1:
             return limit_share_of_runs(share, np.zeros((len(share), over.count)), 1, confidence)
         units = over.weigh_units(self.weight)
-        of_group = np.bincount(over.grouped, units)
-        without = incidences_without(
-            *self.endings, self.weight, over.group, len(of_group), at_s, least=self.least
+        group_units = np.bincount(over.grouped, units)
+        share_without = incidences_without(
+            *self.endings, self.weight, over.group, len(group_units), at_s, least=self.least
         ).T  # fmt: skip
         if over.once:
-            return self._limit_incidence_once(over, at_s, share, without, confidence)
-        residual = (of_group.sum() - of_group) * (share[:, None] - without)
-        variance = share_variance(residual, np.broadcast_to(of_group, residual.shape))
-        within = np.where(variance > _SAME**2, 0.0, 1.0) if over.by_run else WITHIN_LOG
+            return self._limit_incidence_once(over, at_s, share, share_without, confidence)
+        residual = (group_units.sum() - group_units) * (share[:, None] - share_without)
+        variance = share_variance(residual, np.broadcast_to(group_units, residual.shape))
+        within_log = np.where(variance > _SAME**2, 0.0, 1.0) if over.by_run else WITHIN_LOG
         units = np.broadcast_to(units * (over.units if over.by_run else 1.0), (len(share), over.count))
-        return spread_share(share, variance, units, confidence, within)
+        return spread_share(share, variance, units, confidence, within_log)
 
     def _limit_incidence_once(
         self, over: Clusters, at_s: Float, share: Float, without: Float, confidence: float
@@ -219,17 +219,17 @@ class FigureRows:
         return limit_bounded_mean(share, without, groups, (0.0, 1.0), 1.0, confidence, unseen)
 
     def limit_distance_quantile(self, q: float, confidence: float, bound: float | None = None) -> LimitedFigure:
-        """The distance beyond which a share 1 − q is detected, with limits; −∞: fewer are ever detected."""
+        """The distance (m) beyond which a share 1 − q is detected, with limits; −∞: fewer are ever detected."""
         distance_m = self.table["distance_at_detection_m"].to_numpy(dtype=float)
-        placed = ~self.known | ~np.isnan(distance_m)
-        weight, ranked = self.weight[placed], np.where(self.known, distance_m, -np.inf)[placed]
-        if not placed.any():
+        has_distance = ~self.known | ~np.isnan(distance_m)
+        weight, ranked = self.weight[has_distance], np.where(self.known, distance_m, -np.inf)[has_distance]
+        if not has_distance.any():
             return LimitedFigure(None)
-        found = quantile_with_never(ranked, self.known[placed], q, weight)
-        value = -math.inf if found is None else found
+        distance_or_none = quantile_with_never(ranked, self.known[has_distance], q, weight)
+        value = -math.inf if distance_or_none is None else distance_or_none
         if self.clusters is None:
             return LimitedFigure(value)
-        clusters = self.clusters.select(placed)
+        clusters = self.clusters.select(has_distance)
         units = None if clusters.by_run else clusters.units
         low, high = limit_ranked_quantile(
             ranked, weight, clusters.number, clusters.count, units, q, confidence, once=clusters.once
@@ -237,8 +237,8 @@ class FigureRows:
         if bound is None:
             return LimitedFigure(value, low, high, INVERTED)
         beyond = np.where(ranked >= bound, weight, 0.0)
-        least, most = clusters.limit_share(beyond, weight, confidence)
-        return LimitedFigure(value, low, high, INVERTED, (least, float(beyond.sum() / weight.sum()), most))
+        low_share, high_share = clusters.limit_share(beyond, weight, confidence)
+        return LimitedFigure(value, low, high, INVERTED, (low_share, float(beyond.sum() / weight.sum()), high_share))
 
 
 def limit_sums(

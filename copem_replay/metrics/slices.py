@@ -59,7 +59,7 @@ def find_unknown_tag(slices: Sequence[Slice], tags: Tags) -> str | None:
 
 
 def _name_values(table: pd.DataFrame, dimension: Dimension, tags: Tags) -> tuple[Int, list[str]]:
-    """(n,) the value of each row as a position in the list, which is in the order in which groups are shown."""
+    """(n,) the value of each row as a position in a list of names, which is in the order in which groups are shown."""
     if dimension.name == LOG:
         position, logs = pd.factorize(table["log"])
         return position, [str(log) for log in logs]
@@ -141,9 +141,9 @@ def sum_episodes(rows: pd.DataFrame, metrics: Sequence[RowMetric], words: Sequen
 
 
 def _accuracy_columns(rows: pd.DataFrame) -> dict[str, Any]:
-    """(n,) the sums that the figures of each row are made of."""
+    """Columns (n,) of each row, such as a count or a sum of squares, whose sums give the accuracy of many rows."""
     pairs = rows["matched_lists"].to_numpy(dtype=float)
-    placed = pairs - rows["unplaced_lists"].to_numpy(dtype=float)
+    placed_lists = pairs - rows["unplaced_lists"].to_numpy(dtype=float)
 
     def times(name: str, number: Any, power: int = 1) -> Any:
         return np.nan_to_num(rows[name].to_numpy(dtype=float)) ** power * number
@@ -151,12 +151,12 @@ def _accuracy_columns(rows: pd.DataFrame) -> dict[str, Any]:
     gap_s, switches = (rows[name].to_numpy(dtype=float) for name in ("longest_gap_s", "identity_switches"))
     return {
         "pairs": pairs,
-        "placed": placed,
-        "square_m2": times("position_rmse_m", placed, 2),
+        "placed": placed_lists,
+        "square_m2": times("position_rmse_m", placed_lists, 2),
         "square_then_m2": times("position_rmse_captured_m", pairs, 2),
-        "east_m": times("bias_east_m", placed),
-        "north_m": times("bias_north_m", placed),
-        "velocity_square_m2ps2": times("velocity_rmse_mps", placed, 2),
+        "east_m": times("bias_east_m", placed_lists),
+        "north_m": times("bias_north_m", placed_lists),
+        "velocity_square_m2ps2": times("velocity_rmse_mps", placed_lists, 2),
         "nees": times("nees", pairs),
         "age_of_information_s": times("age_of_information_s", pairs),
         "switches": np.nan_to_num(switches),
@@ -271,10 +271,7 @@ class StudyRows:
         return replace(self, tally=rows_of("tally"), exact=rows_of("exact"), sums=rows_of("sums"), lists=lists)
 
     def split(self, entry: Slice) -> list[Group]:
-        """The groups of an entry, each with at least one episode, in the order in which they are shown.
-
-        By `began` each group counts its own episodes, whatever `measure.began` says.
-        """
+        """The groups of an entry that have an episode, in the order shown. By `began`, each counts its own ones."""
         number, names = number_groups(self.episodes, entry, self.tags)
         settings = replace(self.settings, words=BEGAN) if entry.names(BEGAN_BY) else self.settings
         logs_of: dict[tuple[str, ...], list[str]] = {}
@@ -318,7 +315,7 @@ class StudyRows:
         return sums_of
 
     def _total(self, configuration: str, settings: AccuracySettings) -> AccuracyTotal:
-        """The sums of accuracy that the rows tell; NaN: those that they do not."""
+        """The accuracy sums of a configuration, as far as the rows tell them; NaN: those they do not."""
         names = [*_SUMMED, *_ROWS]
         sums = dict(zip(names, self._of(configuration)(self.sums)[names].to_numpy().sum(axis=0), strict=True))
         episodes, runs, existence = (
@@ -381,9 +378,9 @@ def summarise_groups(study: StudyRows, slices: Sequence[Slice]) -> pd.DataFrame:
 def _summarise_group(
     group: Group, shares: Mapping[str, float | None], metrics: Sequence[Metric]
 ) -> Iterator[dict[str, Any]]:
-    """The rows of `summary_by.csv` of a group. `shares`: by configuration the detected share of all groups."""
+    """A group's rows of `summary_by.csv`. `shares`: by configuration the detected share in all groups."""
     rows = group.rows.detections
-    short = describe_followed(rows, group.rows.settings.horizon_s) if len(rows) else None
+    followed_note = describe_followed(rows, group.rows.settings.horizon_s) if len(rows) else None
     for name, share in shares.items():
         inputs = group.rows.inputs(name)
         figures = evaluate_metrics(metrics, inputs)
@@ -399,7 +396,7 @@ def _summarise_group(
             "logs": logs,
             "objects": objects,
             "apart": _is_apart(figures, share),
-            "note": "; ".join([*notes, *filter(None, [short])]) or None,
+            "note": "; ".join([*notes, *filter(None, [followed_note])]) or None,
             **{column: None if value != value else value for column, value in figures.items()},
         }
 

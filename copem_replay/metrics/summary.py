@@ -102,10 +102,11 @@ def list_runs(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
+    """The tally of `event`: rows (n,) of episodes with equal times counted as one, with the number of `runs`."""
     columns = {name: source for name, source in _EVENT_COLUMNS[event].items() if source in rows}
     time_s = rows[columns["time_to_detection_s"]].to_numpy(dtype=float)
-    happened = rows["detected" if event == DETECTED else "conflict_detected"].to_numpy(dtype=bool)
-    time_s = np.where(happened, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
+    has_event = rows["detected" if event == DETECTED else "conflict_detected"].to_numpy(dtype=bool)
+    time_s = np.where(has_event, time_s + 0.0, np.inf)  # −0 is 0, and never comes last
     episode = np.zeros(len(rows), dtype=np.int64)
     for name in ("configuration", *EPISODE):
         episode = _number_pairs(episode, rows[name])[0]
@@ -122,9 +123,9 @@ def _tally_event(rows: pd.DataFrame, event: str) -> pd.DataFrame:
         "runs": runs,
     }
     if "conflict" in rows:
-        passed = rows["braking_pass"].fillna(False).to_numpy(dtype=bool)
+        passes = rows["braking_pass"].fillna(False).to_numpy(dtype=bool)
         tallied["in_conflict"] = rows["conflict"].to_numpy(dtype=bool)[first_of]
-        tallied["passed"] = np.bincount(group, passed, minlength=len(order)).astype(np.int64)[order]
+        tallied["passed"] = np.bincount(group, passes, minlength=len(order)).astype(np.int64)[order]
     return pd.DataFrame(tallied)
 
 
@@ -302,13 +303,13 @@ def _note_no_interval(detections: pd.DataFrame) -> list[str]:
 
 
 def _note_beyond_gate(accuracy: Mapping[str, AccuracyTotal]) -> list[str]:
-    """Which configurations claim covariances so large that the gate cuts off some errors."""
+    """A note on configurations whose covariances are so large that the gate cuts errors off; empty: there are none."""
     shares = {name: beyond_gate_share(of) or 0.0 for name, of in accuracy.items()}
-    cut = {name: share for name, share in shares.items() if share >= MUCH_BEYOND}
-    if not cut:
+    cut_shares = {name: share for name, share in shares.items() if share >= MUCH_BEYOND}
+    if not cut_shares:
         return []
-    gate_m = accuracy[next(iter(cut))].settings.gate_m
-    words = ", ".join(f"{name} {100 * share:.2g} %" for name, share in cut.items())
+    gate_m = accuracy[next(iter(cut_shares))].settings.gate_m
+    words = ", ".join(f"{name} {100 * share:.2g} %" for name, share in cut_shares.items())
     return [
         f"position errors expected beyond the gate of {gate_m:g} m, by the claimed covariances: {words}; RMSE and NEES "
         "are without them, so true covariances have a NEES of nees_expected, not 2 (a larger `measure: {match: "
@@ -468,7 +469,7 @@ def _align_column(column: Sequence[str], *, to_left: bool) -> list[str]:
 
 
 def _split_columns(first: Sequence[str], others: Sequence[list[str]], width: int | None) -> list[list[list[str]]]:
-    """The other columns in groups that fit beside the first one; each group has at least one."""
+    """The other columns in groups that fit beside the first one within `width` (None: any); none is empty."""
     blocks: list[list[list[str]]] = []
     width_used = 0
     for column in others:

@@ -83,19 +83,19 @@ class DetectionStatistics:
 def _detection_statistics(
     part: pd.DataFrame, detected: Bool, weight: Float, horizon_s: float | None, least: float = 1e-12
 ) -> DetectionStatistics:
-    """Statistics of rows (n,), each counting by its `weight`. `least`: as for `cumulative_incidence`."""
+    """Curve and distances of rows (n,), each counting by its `weight`. `least`: as for `cumulative_incidence`."""
     if not len(part):
         nothing = np.empty(0)
         return DetectionStatistics(nothing, nothing, nothing, np.empty(0, dtype=bool), nothing, None, rows=False)
     ending = np.where(detected, DETECTED, np.where(is_competing(part["ended_by"]), LEFT, CENSORED))
-    looked_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
+    observed_s = (part["ended_s"] - part["onset_s"]).to_numpy(dtype=float)
     # To a nanosecond: of equal times detections come first, and 1 − 0.8 is less than 0.2 − 0.
-    time_s = np.round(np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), looked_s), 9)
+    time_s = np.round(np.where(detected, part["time_to_detection_s"].to_numpy(dtype=float), observed_s), 9)
     times, incidence = cumulative_incidence(time_s, ending, weight, least=least)
     distance_m = part["distance_at_detection_m"].to_numpy(dtype=float)
-    placed = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
+    has_distance = ~detected | ~np.isnan(distance_m)  # detected during a gap of the truth: no distance to rank
     return DetectionStatistics(
-        times, incidence, distance_m[placed], detected[placed], weight[placed], horizon_s, rows=True
+        times, incidence, distance_m[has_distance], detected[has_distance], weight[has_distance], horizon_s, rows=True
     )
 
 
@@ -135,7 +135,7 @@ class ShareEstimate:
 def _estimate_share(
     part: pd.DataFrame, successes: NDArray[np.int64], inputs: MetricInputs, fixed: str
 ) -> ShareEstimate:
-    """The share of `successes (n,)` among the runs of the tally's rows (n,). `fixed`: the fact that all are alike."""
+    """The share of `successes (n,)` in the runs of tally rows (n,), with limits; `fixed`: fact that all are alike."""
     n, weight = int(part["runs"].sum()), weigh_rows(part, "runs", inputs.weigh)
     counted = successes * (weight / part["runs"].to_numpy(dtype=float))
     total = float(counted.sum())
@@ -175,18 +175,18 @@ class UnknownTimes:
 
 
 def _measure_unknown(rows: pd.DataFrame, known: Bool, weight: Float, horizon_s: float | None) -> UnknownTimes:
-    """Of rows (n,) that count by their `weight (n,)`; `known (n,)`: which are detected."""
+    """Times unknown (s) and shares never known, of rows (n,) that count by `weight`; `known (n,)`: detected."""
     total = float(weight.sum())
     if not total:
         return UnknownTimes()
     length_s = (rows["ended_s"] - rows["onset_s"]).to_numpy(dtype=float)
     unknown_s = compute_unknown_s(rows["time_to_detection_s"].to_numpy(dtype=float), length_s)
-    left = is_competing(rows["ended_by"]) & ~known
+    left_unknown = is_competing(rows["ended_by"]) & ~known
     return UnknownTimes(
         float(weight @ unknown_s) / total,
         None if horizon_s is None else float(weight @ np.minimum(unknown_s, horizon_s)) / total,
-        float(weight[left].sum()) / total,
-        float(weight[~known & ~left].sum()) / total,
+        float(weight[left_unknown].sum()) / total,
+        float(weight[~known & ~left_unknown].sum()) / total,
     )
 
 
@@ -260,10 +260,8 @@ def summarise_exact(inputs: MetricInputs) -> ExactStatistics | None:
 
 
 def _summarise_missed(rows: pd.DataFrame) -> dict[str, float | None]:
-    """How probably an episode misses its object, from the rows of `exact.parquet` for never: one per episode.
-
-    Base-10 logarithms of the mean probability. Its derivative by the log-odds of detection weighs each episode by its
-    share of the mean.
+    """Base-10 logarithm of the mean probability to miss an object, also at half the odds, from the “never” rows of
+    `exact.parquet`. Its derivative by the log-odds of detection weighs each episode by its share of the mean.
     """
     names = ("miss_log10", "miss_log10_half_odds")
     if not rows["miss_log10"].notna().any():
@@ -299,7 +297,7 @@ def _number_or_none(value: float) -> float | None:
 def _limit_metrics(
     share: str, statistics: Callable[[MetricInputs], ShareEstimate | None], prefix: str = ""
 ) -> tuple[Metric, ...]:
-    """The columns beside a share: its limits, their kind, and the clusters they are over."""
+    """The metrics beside a `share`: its lower and upper limit, their kind, and the clusters they are over."""
     row = partial(Metric, statistics=statistics, better=0)
     return (
         row(f"{share}_low", value=attrgetter("low"), help=f"lower limit of {share}, 95 %"),

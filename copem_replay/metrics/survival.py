@@ -159,16 +159,17 @@ class _RestOfClusters:
 def _leave_out_clusters(
     time_s: Float, ending: NDArray[np.integer[Any]], weight: Float, cluster: Int, clusters: int, least: float
 ) -> _RestOfClusters:
+    """For each of K clusters, of the rows without it: weight (K,), and factors handed on by span (K, spans)."""
     censored = ending == CENSORED
     lost_s = np.unique(time_s[censored])
     span = np.searchsorted(lost_s, time_s, side="left")
     left_out = _RestOfClusters(cluster, clusters, span, np.empty(0), np.empty(0))
-    within = left_out.sums(weight, span, len(lost_s) + 1)
-    total = within.sum(axis=1)
-    lost = left_out.sums(np.where(censored, weight, 0.0), span, len(lost_s) + 1)[:, :-1]
-    remaining = total[:, None] - np.cumsum(within, axis=1)[:, :-1]
-    remains = remaining >= np.maximum(least * total * (1 - 1e-9), 1e-300)[:, None]
-    factors = np.where(remains, 1.0 + lost / np.where(remains, remaining, 1.0), 1.0)
+    span_weight = left_out.sums(weight, span, len(lost_s) + 1)
+    total = span_weight.sum(axis=1)
+    censored_weight = left_out.sums(np.where(censored, weight, 0.0), span, len(lost_s) + 1)[:, :-1]
+    remaining = total[:, None] - np.cumsum(span_weight, axis=1)[:, :-1]
+    has_remaining = remaining >= np.maximum(least * total * (1 - 1e-9), 1e-300)[:, None]
+    factors = np.where(has_remaining, 1.0 + censored_weight / np.where(has_remaining, remaining, 1.0), 1.0)
     handed = np.concatenate([np.ones((clusters, 1)), np.cumprod(factors, axis=1)], axis=1)
     return replace(left_out, total=total, handed=handed)
 

@@ -142,27 +142,27 @@ def _draw_born(
     numbered: tuple[int, GhostModel],
     runs: Int,
 ) -> _Born:
-    """The ghosts of one sort that are in any of the lists."""
+    """The ghosts of one sort (`numbered`: its number and model) that are in any list of a unit, and their lists."""
     n, sort = numbered
     hosts = _find_hosts(scene, observations, lists, sort)
-    none = np.zeros(len(hosts.words), dtype=np.int64)
-    random_key = RandomKey((lists.name,), none, hosts.words, none)
+    zeros = np.zeros(len(hosts.words), dtype=np.int64)
+    random_key = RandomKey((lists.name,), zeros, hosts.words, zeros)
     salt = np.uint64(stable_hash("ghosts", n))
     if sort.lasts_s == 0:
         return _draw_fresh(rng, hosts, lists, numbered, runs, salt)
     stamps = lists.stamp_ns
-    alive = draw_births(
+    births = draw_births(
         rng, f"ghosts {n}", random_key, runs, every_s=sort.lasts_s / sort.in_list, lasts_s=sort.lasts_s,
         from_ns=int(stamps[0]), until_ns=int(stamps[-1]) + 1,
     )  # fmt: skip
-    first, after = np.searchsorted(stamps, alive.born_ns), np.searchsorted(stamps, alive.gone_ns)
-    ghost = np.repeat(np.arange(len(first)), after - first)
-    list_ix = np.arange(len(ghost)) - np.repeat(np.cumsum(after - first) - (after - first), after - first)
-    list_ix += first[ghost]
-    host = hosts.row[alive.row_ix[ghost], list_ix] if hosts.row is not None else np.full(len(ghost), -1)
-    beside_host = host >= 0 if hosts.row is not None else np.ones(len(ghost), dtype=bool)
-    words = hosts.words[alive.row_ix] + alive.address_ns.astype(np.uint64) + salt
-    return _Born(words, ghost[beside_host], list_ix[beside_host], host[beside_host])
+    first, after = np.searchsorted(stamps, births.born_ns), np.searchsorted(stamps, births.gone_ns)
+    ghost_ix = np.repeat(np.arange(len(first)), after - first)
+    list_ix = np.arange(len(ghost_ix)) - np.repeat(np.cumsum(after - first) - (after - first), after - first)
+    list_ix += first[ghost_ix]
+    host = hosts.row[births.row_ix[ghost_ix], list_ix] if hosts.row is not None else np.full(len(ghost_ix), -1)
+    beside_host = host >= 0 if hosts.row is not None else np.ones(len(ghost_ix), dtype=bool)
+    words = hosts.words[births.row_ix] + births.address_ns.astype(np.uint64) + salt
+    return _Born(words, ghost_ix[beside_host], list_ix[beside_host], host[beside_host])
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class _Hosts:
 
 
 def _find_hosts(scene: Scene, observations: Observations, lists: _UnitLists, sort: GhostModel) -> _Hosts:
-    """The objects that ghosts of a sort may be beside in the lists of a unit."""
+    """The objects beside which ghosts of a sort may be, with their rows in each list; of other sorts one host, all."""
     if not isinstance(sort.where, ObjectSidePlace):
         zero = np.zeros(1, dtype=np.int64)
         of_all = drop_unshared(RandomKey((lists.name,), zero, zero.astype(np.uint64), zero), "unit")
@@ -186,18 +186,17 @@ def _find_hosts(scene: Scene, observations: Observations, lists: _UnitLists, sor
     of_class = np.isin(observations.view.class_ix, class_indices(sort.where.classes)) & (observations.probability > 0)
     rows = np.flatnonzero((tracks.row_unit_ix == lists.unit_ix) & of_class)
     rows = rows[(tracks.frame_ix[rows] >= lists.frame_ix[0]) & (tracks.frame_ix[rows] <= lists.frame_ix[-1])]
-    objects, which = np.unique(tracks.row_object_ix[rows], return_inverse=True)
+    objects, object_number = np.unique(tracks.row_object_ix[rows], return_inverse=True)
     row = np.full((len(objects), len(lists.frame_ix)), -1)
-    row[which, tracks.frame_ix[rows] - lists.frame_ix[0]] = rows
+    row[object_number, tracks.frame_ix[rows] - lists.frame_ix[0]] = rows
     return _Hosts(object_words(scene.object_ids)[objects], row)
 
 
 def _draw_fresh(
     rng: CounterRng, hosts: _Hosts, lists: _UnitLists, numbered: tuple[int, GhostModel], runs: Int, salt: np.uint64
 ) -> _Born:
-    """New ghosts in every list: their number follows from one uniform of each list (and host), drawn at its capture.
-
-    A ghost's word contains the capture, its instant of birth: so ids, and draws that last, are its own.
+    """New ghosts in every list: their number follows from one uniform of each list (and host), at its capture. A
+    ghost's word contains the capture, its instant of birth: so ids, and draws that last, are its own.
     """
     n, sort = numbered
     H, L = len(hosts.words), len(lists.stamp_ns)
@@ -230,11 +229,11 @@ def _count_ghosts(uniform: Float, mean: float) -> Int:
 def _place_ghosts(
     rng: CounterRng, true: Tracks, lists: _UnitLists, numbered: tuple[int, GhostModel], runs: Int, born: _Born
 ) -> tuple[Tracks, ViewGeometry]:
-    """Ghosts without any error, a track for each, and their view geometry from the unit: wholly visible."""
+    """Tracks of the ghosts, without any error, and their view geometry from the unit: visible share 1."""
     n, sort = numbered
     zeros = np.zeros(len(born.words), dtype=np.int64)
     random_key = RandomKey((lists.name,), zeros, born.words, zeros)
-    place = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
+    place_draws = np.stack([rng.uniform(f"ghosts {n} place {k}", random_key, runs)[0] for k in range(3)])
     turn_rad = 2 * np.pi * rng.uniform(f"ghosts {n} turn", random_key, runs)[0]
     shares = class_row(sort.classes)[None]
     class_ix = draw_classes(shares, zeros, rng.uniform(f"ghosts {n} class", random_key, runs)[0])[born.ghost]
@@ -248,7 +247,7 @@ def _place_ghosts(
         ground_m = true.z_m[0, host] - true.height_m[0, host] / 2
         # An object has one size in all lists, so any row of its ghost gives it.
         length_m[born.ghost], width_m[born.ghost] = true.length_m[0, host], true.width_m[0, host]
-    ahead_m, left_m = sort.where.places_m(place, length_m, width_m)[:, born.ghost]
+    ahead_m, left_m = sort.where.places_m(place_draws, length_m, width_m)[:, born.ghost]
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     size_m = np.array(list(SIZES_M.values()))[class_ix]
     values = {
@@ -267,7 +266,7 @@ def _place_ghosts(
 
 
 def _make_ghost_tracks(true: Tracks, lists: _UnitLists, born: _Born, values: dict[str, Float]) -> Tracks:
-    """Rows of one run as tracks in the lists of `true`, a track for each ghost."""
+    """Rows of one run as tracks in the lists of `true`, a track for each ghost, without objects (−1)."""
     start = np.append(np.flatnonzero(np.diff(born.ghost, prepend=-1)), len(born.ghost))
     return Tracks(
         units=true.units,

@@ -78,19 +78,18 @@ class KeptShares:
     def of(
         self, units: str, world: Tracks, times_s: tuple[float, float, float], compute: Callable[[Tracks], Float]
     ) -> Float:
-        """Shares (U, P) of a world captured from the first of `times_s` on and before the last, cut at the one between.
-
-        `units`: a name for the units. `compute` computes the shares of a part, once for each.
+        """Visible shares (U, P) of a world captured from the first of `times_s` on and before the last, cut at the
+        middle one. `units`: a name for the units. `compute` is asked once for each part.
         """
         from_s, cut_s, until_s = times_s
         shares = self._part(units, world, cut_s, until_s, compute)
         if from_s >= cut_s:
             return shares
-        late = world.row_captured_s >= cut_s
-        whole = np.empty((len(shares), len(late)))
-        whole[:, late] = shares
-        whole[:, ~late] = self._part(units, world, from_s, cut_s, compute)
-        return whole
+        is_late = world.row_captured_s >= cut_s
+        shares_of_all = np.empty((len(shares), len(is_late)))
+        shares_of_all[:, is_late] = shares
+        shares_of_all[:, ~is_late] = self._part(units, world, from_s, cut_s, compute)
+        return shares_of_all
 
     def _part(self, units: str, world: Tracks, from_s: float, until_s: float, seen: Callable[[Tracks], Float]) -> Float:
         shares = self._kept.get((units, from_s, until_s))
@@ -174,7 +173,7 @@ def _ask_for_shares(
     names: Sequence[str], world: Tracks, *, scene: Scene, experiment: PerceptionSetup, placed: SensorPoses,
     as_read: bool, only_ix: Int | None,
 ) -> Bool | None:  # fmt: skip
-    """(U, P) which visible shares of a world are read; None: all."""
+    """(U, P) which visible shares are needed: where a PEM may apply (`as_read`), or of one object; None: all."""
     if only_ix is not None:
         return np.tile(np.isin(world.row_object_ix, only_ix), (len(names), 1))
     if not as_read:
@@ -255,18 +254,18 @@ def compute_view(
 def _assess_rows(
     tracks: Tracks, view: ViewGeometry, experiment: PerceptionSetup, tags: Mapping[str, str]
 ) -> tuple[Int, Float, Float]:
-    """Of each row (P,) the couple of its unit's PEM that applies, its probability, and the existence it claims."""
+    """(P,) the couple of its unit's PEM that applies to each row (−1: none), its probability, and its existence."""
     couple_ix = np.full(len(tracks.frame_ix), -1)
     probability, existence = np.zeros(len(tracks.frame_ix)), np.zeros(len(tracks.frame_ix))
     for unit, rows in zip(experiment.modelled.values(), rows_by_unit(tracks), strict=True):
         pem = experiment.pems[str(unit.pem)].couples
         couple_ix[rows], probability[rows] = assess_view(str(unit.pem), experiment, view.take(rows), tags)
         for c, couple in enumerate(pem):
-            of_couple = rows[couple_ix[rows] == c]
-            if len(of_couple):
+            couple_rows = rows[couple_ix[rows] == c]
+            if len(couple_rows):
                 claimed = couple.existence
                 if not isinstance(claimed, ExistenceScores):  # drawn for each run, in perception/perceive.py
-                    existence[of_couple] = view.visible_share[of_couple] if claimed == "visible_share" else claimed
+                    existence[couple_rows] = view.visible_share[couple_rows] if claimed == "visible_share" else claimed
     return couple_ix, probability, existence
 
 

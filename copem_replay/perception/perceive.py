@@ -84,23 +84,23 @@ def add_states(
 
 
 def _draw_detected(observations: Observations, experiment: PerceptionSetup, draws: UnitDraws) -> Bool:
-    """(S, P) which rows are detected: the addressed uniform is below the probability (0: never, 1: always)."""
+    """(S, P) whether each row is detected: its addressed uniform is below the probability (0: never, 1: always)."""
     P = len(observations.probability)
-    by_parts: dict[tuple[MemoryPart, ...], list[Int]] = {}
+    rows_by_parts: dict[tuple[MemoryPart, ...], list[Int]] = {}
     for unit, unit_rows in zip(experiment.modelled.values(), rows_by_unit(observations.tracks), strict=True):
         pem = experiment.pems[str(unit.pem)]
         for c in range(len(pem.couples)):
             if parts := pem.memory_of(c).get("detection", ()):
-                by_parts.setdefault(parts, []).append(unit_rows[observations.couple_ix[unit_rows] == c])
-    if not by_parts:
+                rows_by_parts.setdefault(parts, []).append(unit_rows[observations.couple_ix[unit_rows] == c])
+    if not rows_by_parts:
         return draws.rng.bernoulli("detection", draws.random_key, draws.runs, observations.probability)
     valid = np.empty((len(draws.runs), P), dtype=np.bool_)
-    memoryless = np.ones(P, dtype=np.bool_)
-    for parts, pieces in by_parts.items():
+    is_memoryless = np.ones(P, dtype=np.bool_)
+    for parts, pieces in rows_by_parts.items():
         rows = np.sort(np.concatenate(pieces))
-        memoryless[rows] = False
+        is_memoryless[rows] = False
         valid[:, rows] = draws.take(rows).uniform("detection", parts) < observations.probability[rows]
-    memoryless_rows = np.flatnonzero(memoryless)
+    memoryless_rows = np.flatnonzero(is_memoryless)
     valid[:, memoryless_rows] = draws.rng.bernoulli(
         "detection", draws.random_key.take(memoryless_rows), draws.runs, observations.probability[memoryless_rows]
     )
@@ -117,7 +117,7 @@ def _draw_noise(draws: UnitDraws | None, memory: Mapping[str, Parts], valid: Boo
 def _add_errors(
     tracks: Tracks, observations: Observations, experiment: PerceptionSetup, draws: UnitDraws | None
 ) -> Tracks:
-    """The lists with the errors of the couples that apply, and the variances that units state."""
+    """The lists with the errors of the couples that apply (`draws` None: mean errors), and stated variances."""
     S, P = tracks.valid.shape
     columns: dict[str, Any] = {}
 
@@ -225,36 +225,36 @@ def _claim_existence(pem: Pem, observations: Observations, rows: Int, draws: Uni
     couple_ix = observations.couple_ix[rows]
     for c, couple in enumerate(pem.couples):
         for n in range(1 if sort is None else len(pem.ghosts)):
-            of_sort = np.flatnonzero((couple_ix == c) & (True if sort is None else sort == n))
+            sort_rows = np.flatnonzero((couple_ix == c) & (True if sort is None else sort == n))
             claimed: Claimed = couple.existence
-            if sort is not None and (own := pem.ghosts[n].existence) is not None:
-                claimed = own
-            if not len(of_sort):
+            if sort is not None and (own_existence := pem.ghosts[n].existence) is not None:
+                claimed = own_existence
+            if not len(sort_rows):
                 continue
             if isinstance(claimed, ExistenceScores):
-                [uniform] = draws.take(of_sort).uniform("existence", pem.memory_of(c).get("existence", ()))
-                existence[of_sort] = claimed.claimed(
+                [uniform] = draws.take(sort_rows).uniform("existence", pem.memory_of(c).get("existence", ()))
+                existence[sort_rows] = claimed.claimed(
                     uniform, of_ghosts=sort is not None, ghosts_in_list=pem.ghosts_in_list
                 )
             else:
-                existence[of_sort] = (
-                    observations.view.visible_share[rows[of_sort]] if claimed == "visible_share" else claimed
+                existence[sort_rows] = (
+                    observations.view.visible_share[rows[sort_rows]] if claimed == "visible_share" else claimed
                 )
     return existence
 
 
 def _claim_classes(pem: Pem, observations: Observations, rows: Int, draws: UnitDraws, *, of_ghosts: bool) -> Float:
-    """(P, C) class probabilities of rows of one unit; the listed class of a ghost is drawn at its birth."""
+    """(P, C) class probabilities that a unit states of its rows; a ghost's listed class is drawn at its birth."""
     class_ix = observations.view.class_ix[rows].astype(np.int64)
     if pem.classes is None:
         return np.eye(len(CLASSES))[class_ix]
     if pem.classes.confusion and not of_ghosts:
-        couple_ix, true = observations.couple_ix[rows], class_ix.copy()
+        couple_ix, true_class = observations.couple_ix[rows], class_ix.copy()
         for c in range(len(pem.couples)):
-            of_couple = np.flatnonzero(couple_ix == c)
-            if len(of_couple):
-                [uniform] = draws.take(of_couple).uniform("class", pem.memory_of(c).get("class", ()))
-                class_ix[of_couple] = pem.classes.listed(true[of_couple], uniform)
+            couple_rows = np.flatnonzero(couple_ix == c)
+            if len(couple_rows):
+                [uniform] = draws.take(couple_rows).uniform("class", pem.memory_of(c).get("class", ()))
+                class_ix[couple_rows] = pem.classes.listed(true_class[couple_rows], uniform)
     return pem.classes.stated(class_ix)
 
 
@@ -305,7 +305,7 @@ def displace_rows(
 
 
 def _shift_rows(tracks: Tracks, rows: Int, at_m: Float, off: tuple[Float, ...]) -> Tracks:
-    """Some rows (K,) shifted and turned about `at_m` (2, K), by `off`: east, north (m) and turn (rad), (S, K) each."""
+    """Rows (K,) shifted and turned about `at_m` (2, K) by `off`: east, north (m) and turn (rad), (S, K) each."""
     east_m, north_m, turn_rad = off
     shape = (len(turn_rad), len(tracks.frame_ix))
     columns: dict[str, Any] = {name: np.array(np.broadcast_to(getattr(tracks, name), shape)) for name in _MOVED}
@@ -343,14 +343,14 @@ def _state_pose_covariance(tracks: Tracks, rows: Int, from_unit_m: Float, placed
 def _draw_pose_errors(
     scene: Scene, tracks: Tracks, frames: Int, placed: PoseError, address: tuple[int, str, Int]
 ) -> tuple[Float, Float, Float]:
-    """Easting, northing (m) and heading (rad) of some lists of a unit: (S, K) each. `address`: seed, unit, runs."""
+    """Pose errors of some lists of a unit: east, north (m), heading (rad), (S, K) each. `address`: seed, unit, runs."""
     seed, name, runs = address
     unit_frames = np.flatnonzero(tracks.frame_unit_ix == tracks.units.index(name))
     lists = ListStamps(
         tracks.stamp_ns[unit_frames], np.zeros(len(unit_frames), dtype=np.int64), np.searchsorted(unit_frames, frames)
     )
-    of_unit = np.zeros(len(frames), dtype=np.int64)
-    random_key = drop_unshared(RandomKey((name,), of_unit, of_unit.astype(np.uint64), tracks.stamp_ns[frames]), "unit")
+    zeros = np.zeros(len(frames), dtype=np.int64)
+    random_key = drop_unshared(RandomKey((name,), zeros, zeros.astype(np.uint64), tracks.stamp_ns[frames]), "unit")
     draws = UnitDraws(CounterRng(seed, scene.log), random_key, lists, runs)
     east, north, yaw = (draws.normal(f"placed {what}", placed.parts) for what in ("east", "north", "yaw"))
     sigma_m, sigma_rad = placed.position_sigma_m, np.deg2rad(placed.yaw_sigma_deg)

@@ -166,17 +166,16 @@ def find_grounds(truth: Tracks, outlines: Sequence[Any] | NDArray[np.object_]) -
 
 
 def _nearest_candidates(x_m: Float, y_m: Float, corners: Float) -> Int:
-    """Indices (R,) of the states that may be nearest to a polygon: all others are farther from its bounding box.
-
-    To build a geometry of a state takes most of the time, and most states are farther away.
+    """Indices (R,) of the states that may be nearest to a polygon: others are farther from its bounding box than one of
+    these. (To build a geometry of a state takes most of the time.)
     """
     (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
-    outside = np.hypot(
+    box_distance_m = np.hypot(
         np.maximum(np.maximum(west - x_m, x_m - east), 0), np.maximum(np.maximum(south - y_m, y_m - north), 0)
     )
     reach = min(float(np.hypot(x_m - x, y_m - y).min()) for x, y in corners)
-    near = np.flatnonzero(outside <= reach * (1 + 1e-9))
-    return near if len(near) else np.arange(len(x_m))
+    near_states = np.flatnonzero(box_distance_m <= reach * (1 + 1e-9))
+    return near_states if len(near_states) else np.arange(len(x_m))
 
 
 def unit_ground(truth: Tracks, name: str, unit: Placement, far_m: dict[str, float] | None = None) -> float:
@@ -274,7 +273,7 @@ def _note_far_grounds(far_m: Mapping[str, float]) -> list[str]:
 
 
 def _note_objects_inside(scene: Scene, truth: Tracks, solids: Sequence[Solid]) -> list[str]:
-    """One note on the objects whose centres are in solids at times; no note where there are none."""
+    """A note, at most, on objects whose centres are in solids at times, as they are hidden there."""
     import shapely
 
     if not solids:
@@ -282,11 +281,11 @@ def _note_objects_inside(scene: Scene, truth: Tracks, solids: Sequence[Solid]) -
     outlines = outline_solids(solids)
     x, y, z = truth.x_m[0], truth.y_m[0], truth.z_m[0]
     west, south, east, north = shapely.total_bounds(outlines)
-    near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
-    point, solid_ix = shapely.STRtree(outlines).query(shapely.points(x[near], y[near]), predicate="within")
-    row, heights = near[point], np.array([(_hides_from_m(solid), solid.top_m) for solid in solids])
-    within = (heights[solid_ix, 0] < z[row]) & (z[row] < heights[solid_ix, 1])
-    row, solid_ix = row[within], solid_ix[within]
+    near_rows = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north))
+    point, solid_ix = shapely.STRtree(outlines).query(shapely.points(x[near_rows], y[near_rows]), predicate="within")
+    row, heights = near_rows[point], np.array([(_hides_from_m(solid), solid.top_m) for solid in solids])
+    is_inside = (heights[solid_ix, 0] < z[row]) & (z[row] < heights[solid_ix, 1])
+    row, solid_ix = row[is_inside], solid_ix[is_inside]
     step_s = float(np.median(np.diff(truth.captured_s))) if len(truth.captured_s) > 1 else 0.0
     clauses = []
     for k in np.unique(solid_ix).tolist():
@@ -329,12 +328,12 @@ def _field_borders(pem: Sequence[Couple], step_rad: float = _ARC_STEP_RAD) -> li
 def _field_outline(
     range_m: tuple[float, float], azimuth_deg: tuple[float, float] | None, step_rad: float
 ) -> list[Float]:
-    """Borders (K, 2) of a field: two circles, or one closed outline."""
+    """Borders (K, 2) in m of a field of view: circles (one if it begins at 0), or one closed outline of a sector."""
     near_m, far_m = range_m
     first, last = np.deg2rad(azimuth_deg or (-180.0, 180.0))
     all_around = last - first >= 2 * np.pi - 1e-9
-    span = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
-    angle = first + np.linspace(0, span, int(np.ceil(span / step_rad - 1e-9)) + 1)
+    span_rad = 2 * np.pi if all_around else np.mod(last - first, 2 * np.pi)
+    angle = first + np.linspace(0, span_rad, int(np.ceil(span_rad / step_rad - 1e-9)) + 1)
     arc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if all_around:
         return [radius_m * arc for radius_m in (near_m, far_m) if radius_m > 0]

@@ -55,17 +55,17 @@ class SightSpans:
     state: Int
 
     def of_units(self, units: Collection[int]) -> SightSpans:
-        """The spans of some units combined: at each instant the best of their states."""
+        """The spans of these units combined (`unit_ix` −1): at each instant the best of their states."""
         rows = np.flatnonzero(np.isin(self.unit_ix, list(units)))
         steps = np.zeros((len(rows), IN_SIGHT + 1), dtype=np.int64)
         steps[np.arange(len(rows)), self.state[rows]] = 1
         episode_ix, at_s = np.tile(self.episode_ix[rows], 2), np.concatenate([self.begin_s[rows], self.end_s[rows]])
         order = np.lexsort((at_s, episode_ix))
         episode_ix, at_s = episode_ix[order], at_s[order]
-        holding = np.cumsum(np.concatenate([steps, -steps])[order], axis=0) > 0
-        state = IN_SIGHT - holding[:, ::-1].argmax(axis=1)
+        is_held = np.cumsum(np.concatenate([steps, -steps])[order], axis=0) > 0
+        state = IN_SIGHT - is_held[:, ::-1].argmax(axis=1)
         end_s = np.append(at_s[1:], np.inf)
-        kept = holding.any(axis=1) & (end_s > at_s)  # where none holds, an episode ends
+        kept = is_held.any(axis=1) & (end_s > at_s)  # where none holds, an episode ends
         return SightSpans(np.full(kept.sum(), -1), episode_ix[kept], at_s[kept], end_s[kept], state[kept])
 
     def first_s(self, state: int, episodes: int) -> Float:

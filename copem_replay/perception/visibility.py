@@ -267,7 +267,7 @@ def find_blockers(world: Tracks, static: Statics, observers: Observers, model: V
 def _compute_views(
     world: Tracks, static: Statics, observers: Observers, needed: Bool | None, *, flat: bool, blockers: bool
 ) -> tuple[Float, Int]:
-    """Shares and blockers (U, P), rows list by list; blockers empty unless wanted."""
+    """Shares (U, P) by list, NaN: not needed; with `blockers` also which row hides most of each (−1: none)."""
     order, bounds = world.by_frame
     n_units, n_frames = observers.present.shape
     out = np.full((n_units, len(order)), np.nan)

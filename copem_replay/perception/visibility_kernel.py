@@ -189,7 +189,7 @@ def _view_lists(
     f0: int, f1: int, boxes: Boxes, obstacles: Statics, places: Observers, asked: Bool, flat: bool, out: Float,
     blocker: Int, room: tuple[Float, Any], still: _Still, index: _Index, found: _Found, work: _Work,
 ) -> None:  # fmt: skip
-    # Bodies of one list: the boxes first, then the static parts. Everything is relative to the observer.
+    """Fills `out (U, P)`, and `blocker`, for lists f0 … f1 − 1. Bodies of a list: the boxes, then the static parts."""
     xy, of = room
     _gather_statics(obstacles, still)
     for f in range(f0, f1):
@@ -200,9 +200,9 @@ def _view_lists(
         for u in range(places.present.shape[0]):
             if places.present[u, f] and _find_next(0, u, first, n, asked) < n:
                 eye_m = (places.place_m[u, f, 0], places.place_m[u, f, 1], places.place_m[u, f, 2])
-                mine = places.carrier_ix[u]
+                carrier_ix = places.carrier_ix[u]
                 _look_around(
-                    u, eye_m, n, boxes.object_ix[first : first + n], mine, flat, xy, bodies, work.azimuth, still
+                    u, eye_m, n, boxes.object_ix[first : first + n], carrier_ix, flat, xy, bodies, work.azimuth, still
                 )
                 _index_bodies(bodies, index)
                 t = -1
@@ -210,7 +210,7 @@ def _view_lists(
                     t = _find_next(t + 1, u, first, n, asked)
                     if t >= n:
                         break
-                    if boxes.object_ix[first + t] == mine:
+                    if boxes.object_ix[first + t] == carrier_ix:
                         continue
                     share, b, alone = 1.0, -1, len(blocker) > 0
                     if not bodies[t].inside:
@@ -242,7 +242,7 @@ def _gather_statics(obstacles: Statics, still: _Still) -> None:
 
 @borrowing
 def _gather_bodies(first: int, n: int, boxes: Boxes, still: _Still, xy: Float, of: Any) -> None:
-    # Out: the bodies of one list.
+    """Fills `of` and `xy` with the bodies of one list: n boxes from `first` on, then the static parts."""
     for b in range(n):
         of[b].size, of[b].owner = 4, -1
         of[b].bottom_m, of[b].top_m = boxes.bottom_m[first + b], boxes.top_m[first + b]
@@ -272,19 +272,19 @@ def _look_around(
     u: int, eye_m: tuple[float, float, float], n: int, object_ix: Int, mine: int, flat: bool, xy: Float, of: Any,
     azimuth: Float, still: _Still,
 ) -> None:  # fmt: skip
-    # Out: what of the bodies depends on the observer u. Static ones are as before where it has not moved for two lists.
+    """Fills what of the bodies depends on observer u; static ones are copied if it has not moved for two lists."""
     count = len(still.of)
-    stands = u < len(still.eye_m) and (
+    has_not_moved = u < len(still.eye_m) and (
         still.eye_m[u, 0] == eye_m[0] and still.eye_m[u, 1] == eye_m[1] and still.eye_m[u, 2] == eye_m[2]
     )
-    there = stands and still.kept[u]
-    _look_at_bodies(eye_m, n, object_ix, mine, flat, xy, of[:n] if there else of, azimuth)
-    if there:
+    is_cached = has_not_moved and still.kept[u]
+    _look_at_bodies(eye_m, n, object_ix, mine, flat, xy, of[:n] if is_cached else of, azimuth)
+    if is_cached:
         for g in range(count):
             of[n + g] = still.seen[u, g]
             for k in range(still.of[g].size):
                 azimuth[n + g, k] = still.azimuth[u, g, k]
-    elif stands:
+    elif has_not_moved:
         still.kept[u] = True
         for g in range(count):
             still.seen[u, g] = of[n + g]
@@ -299,7 +299,7 @@ def _look_around(
 def _look_at_bodies(
     eye_m: tuple[float, float, float], n: int, object_ix: Int, mine: int, flat: bool, xy: Float, of: Any, azimuth: Float
 ) -> None:
-    # Out: what of the bodies depends on the observer. The first n are boxes; `mine`: the object that carries the unit.
+    """Fills what of bodies depends on the observer. The first n are boxes; `mine`: the object that carries the unit."""
     ox, oy, oz = eye_m
     for b in range(len(of)):
         # A unit that touches a box is in it: some logs hold the mast, too. A unit that touches an obstacle is
@@ -310,8 +310,8 @@ def _look_at_bodies(
         body.inside = body.distance_m <= body.radius_m + _SURELY and _contains(
             xy[b], body.size, ox, oy, 0.0 if b < n else _OVERLAP_M
         )
-        apart = _ON_TOP_M if b < n else -_OVERLAP_M
-        body.over = not flat and body.inside and (oz > body.top_m + apart or oz < body.bottom_m - apart)
+        margin_m = _ON_TOP_M if b < n else -_OVERLAP_M
+        body.over = not flat and body.inside and (oz > body.top_m + margin_m or oz < body.bottom_m - margin_m)
         body.hides = (body.over or not body.inside) and not (b < n and object_ix[b] == mine)
         body.lo = body.hi = 0.0
         if body.over:
@@ -331,22 +331,22 @@ def _look_at_bodies(
 
 @borrowing
 def _bound_slopes(polygon: Float, eye_m: tuple[float, float, float], flat: bool, body: Any) -> None:
-    # Out: distances and slopes of a body. One too near to be sure of is infinitely far: it surely hides nothing.
-    near_m2, far_m2, short = np.inf, 0.0, False
+    """Fills distances and slopes of a body. One too near to be sure of is infinitely far: it surely hides nothing."""
+    near_m2, far_m2, has_short_edge = np.inf, 0.0, False
     for k in range(body.size):
         m = k + 1 if k + 1 < body.size else 0
         ax, ay = polygon[k, 0] - eye_m[0], polygon[k, 1] - eye_m[1]
         ex, ey = polygon[m, 0] - polygon[k, 0], polygon[m, 1] - polygon[k, 1]
         along, length2 = -(ax * ex + ay * ey), ex * ex + ey * ey
-        short |= length2 < _BESIDE_M * _BESIDE_M
+        has_short_edge |= length2 < _BESIDE_M * _BESIDE_M
         if along >= length2:  # nearest at the next corner
             along = 0.0
-        part = along / length2 if along > 0.0 else 0.0
-        px, py = ax + part * ex, ay + part * ey
+        edge_part = along / length2 if along > 0.0 else 0.0
+        px, py = ax + edge_part * ex, ay + edge_part * ey
         near_m2, far_m2 = min(near_m2, px * px + py * py), max(far_m2, ax * ax + ay * ay)
     near_m, far_m = np.sqrt(near_m2), np.sqrt(far_m2)
     body.near_m, body.far_m = near_m, far_m
-    if near_m <= _BESIDE_M or short or body.inside:
+    if near_m <= _BESIDE_M or has_short_edge or body.inside:
         body.near_m, body.far_m = 0.0, np.inf
         return
     bottom, top = body.bottom_m - eye_m[2], body.top_m - eye_m[2]
@@ -361,7 +361,7 @@ def _bound_slopes(polygon: Float, eye_m: tuple[float, float, float], flat: bool,
 
 @borrowing
 def _index_bodies(of: Any, index: _Index) -> None:
-    # Out: the bodies that may hide something.
+    """Fills the index of bodies that may hide something: by distance, and by sector of azimuth as bits."""
     bodies, total_m = len(of), 1.0
     if bodies == 0:
         return
@@ -406,32 +406,33 @@ def _find_sectors(body: Any, sectors: int) -> tuple[int, int]:
 
 @borrowing
 def _find_near_bodies(t: int, all_: bool, xy: Float, of: Any, index: _Index, found: _Found) -> tuple[int, int]:
-    # Out: the bodies that may hide a part of target t, and azimuths that are covered. Returns the numbers of both.
-    # Unless `all_` are asked for, it ends where all azimuths are covered.
+    """Fills `found` with bodies that may hide a part of target t, and with covered azimuths; returns how many of both.
+    Unless `all_`, it ends where all azimuths are covered.
+    """
     sectors, bodies = min(_MOST_SECTORS, 4 * len(of)), len(of)
     first, last = _find_sectors(of[t], sectors)
-    reach_m, lo, hi = of[t].distance_m + of[t].radius_m, of[t].lo, of[t].hi
-    words = index.ends[min(_find_depth(reach_m, bodies, index) + 1, bodies - 1)] // _WORD + 1  # nothing beyond
+    far_end_m, lo, hi = of[t].distance_m + of[t].radius_m, of[t].lo, of[t].hi
+    words = index.ends[min(_find_depth(far_end_m, bodies, index) + 1, bodies - 1)] // _WORD + 1  # nothing beyond
     count = n_covered = 0
     for w in range(words):
-        left = 0
+        bits_left = 0
         for k in range(first, last + 1):
-            left |= index.bits[k if k < sectors else k - sectors, w]
-        while left != 0:
-            b = index.order[w * _WORD + _PLACE_OF[((left & -left) * _LOWEST_BIT >> 58) & 63]]
-            left &= left - 1
-            if b == t or of[b].begins_m > reach_m:
+            bits_left |= index.bits[k if k < sectors else k - sectors, w]
+        while bits_left != 0:
+            b = index.order[w * _WORD + _PLACE_OF[((bits_left & -bits_left) * _LOWEST_BIT >> 58) & 63]]
+            bits_left &= bits_left - 1
+            if b == t or of[b].begins_m > far_end_m:
                 continue
-            turn = of[b].bearing - of[t].bearing
-            turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
-            ahead = turn + of[b].lo < hi and turn + of[b].hi > lo
-            left_round, right_round = turn + of[b].hi - 2 * np.pi > lo, turn + of[b].lo + 2 * np.pi < hi
-            if not (ahead or left_round or right_round):
+            turn_rad = of[b].bearing - of[t].bearing
+            turn_rad -= 2 * np.pi * np.rint(turn_rad / (2 * np.pi))
+            meets_ahead = turn_rad + of[b].lo < hi and turn_rad + of[b].hi > lo
+            left_round, right_round = turn_rad + of[b].hi - 2 * np.pi > lo, turn_rad + of[b].lo + 2 * np.pi < hi
+            if not (meets_ahead or left_round or right_round):
                 continue
             since, until = -np.inf, np.inf
-            if of[b].near_m > 0.0 and ahead + left_round + right_round == 1:
-                turn += 2 * np.pi if right_round else -2 * np.pi if left_round else 0.0
-                since, until = turn + of[b].lo, turn + of[b].hi
+            if of[b].near_m > 0.0 and meets_ahead + left_round + right_round == 1:
+                turn_rad += 2 * np.pi if right_round else -2 * np.pi if left_round else 0.0
+                since, until = turn_rad + of[b].lo, turn_rad + of[b].hi
             if since > -np.inf and _surely_covers(of[b], of[t]):
                 n_covered = _cover_azimuths(since, until, n_covered, found.covered)
                 if not all_ and _covers_all(lo, hi, found.covered[:n_covered]):
@@ -466,7 +467,7 @@ def _surely_covers(body: Any, target: Any) -> bool:
 
 @nb.njit(inline="always")
 def _cover_azimuths(since: float, until: float, n: int, covered: Float) -> int:
-    # Adds an interval to those that are covered[:n]; those that overlap surely become one. Returns their number.
+    """Adds an interval to covered[:n]; those that surely overlap become one. Returns their new number."""
     k = 0
     while k < n and covered[k, 1] < since + 2 * _SURELY:
         k += 1
@@ -494,25 +495,25 @@ def _covers_all(lo: float, hi: float, covered: Float) -> bool:
 
 @borrowing
 def _keep_what_matters(t: int, count: int, covered: Float, of: Any, found: _Found) -> int:
-    # Out: the bodies that may hide a part of target t at an azimuth that is not covered. Returns their number.
-    kept = 0
+    """Fills `found.kept` with bodies that may hide target t where it is not covered; returns how many."""
+    kept_count = 0
     for i in range(count):
         since, until = found.span[i, 0], found.span[i, 1]
         lo, hi = max(since - _SURELY, of[t].lo), min(until + _SURELY, of[t].hi)
-        matters = True
+        may_hide = True
         for k in range(len(covered)):
             if lo >= covered[k, 0] + 2 * _SURELY and hi <= covered[k, 1] - 2 * _SURELY:
-                matters = False
-        if not matters:
+                may_hide = False
+        if not may_hide:
             continue
-        j = kept
+        j = kept_count
         while j > 0 and found.kept[j - 1] > found.near[i]:
             found.kept[j], found.kept_span[j, 0] = found.kept[j - 1], found.kept_span[j - 1, 0]
             found.kept_span[j, 1] = found.kept_span[j - 1, 1]
             j -= 1
         found.kept[j], found.kept_span[j, 0], found.kept_span[j, 1] = found.near[i], since, until
-        kept += 1
-    return kept
+        kept_count += 1
+    return kept_count
 
 
 @borrowing
@@ -520,26 +521,26 @@ def _view_target(
     t: int, alone: bool, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool, index: _Index,
     found: _Found, work: _Work,
 ) -> tuple[float, int]:  # fmt: skip
-    # The share of target t that is visible; and the body that `alone` hides most of it, −1: none hides any of it.
+    """The visible share of target t; and, if `alone`, the body that hides most of it by itself (−1: none hides any)."""
     count, n_covered = _find_near_bodies(t, alone, xy, of, index, found)
-    share, least, most = 1.0, 1.0 - 1e-9, -1
+    share, least_share, main_blocker = 1.0, 1.0 - 1e-9, -1
     if _covers_all(of[t].lo, of[t].hi, found.covered[:n_covered]):
         share = 0.0
         if not alone:
-            return share, most
+            return share, main_blocker
     # At first all bodies at once, then each, which is compiled once.
     for which in range(-1 if count > 0 and share > 0.0 else 0, count if alone else 0):
         covered = found.covered[: n_covered if which < 0 else 0]
         kept = _keep_what_matters(t, count, covered, of, found) if which <= 0 else count
         first, after = (0, kept) if which < 0 else (which, which + 1)
-        left = _visible_share(
+        visible_share = _visible_share(
             t, found.kept[first:after], found.kept_span[first:after], covered, xy, of, eye_m, flat, work
         )
         if which < 0:
-            share = left
-        elif left < least:
-            least, most = left, found.kept[which]
-    return share, most
+            share = visible_share
+        elif visible_share < least_share:
+            least_share, main_blocker = visible_share, found.kept[which]
+    return share, main_blocker
 
 
 @nb.njit(inline="always")
@@ -556,17 +557,17 @@ def _contains(polygon: Float, size: int, px: float, py: float, depth_m: float) -
 
 @callee
 def _are_separated(a: Float, na: int, b: Float, nb_: int) -> bool:
-    # Whether some edge of a has all of b on its outer side (or touching it).
+    """Whether all of polygon b is on the outer side of (or touches) some edge of polygon a."""
     for k in range(na):
         m = k + 1 if k + 1 < na else 0
         ex, ey = a[m, 0] - a[k, 0], a[m, 1] - a[k, 1]
-        reach = np.sqrt(ex * ex + ey * ey) * _OVERLAP_M
-        outside = True
+        tolerance = np.sqrt(ex * ex + ey * ey) * _OVERLAP_M
+        is_outside = True
         for j in range(nb_):
-            if ex * (b[j, 1] - a[k, 1]) - ey * (b[j, 0] - a[k, 0]) > reach:
-                outside = False
+            if ex * (b[j, 1] - a[k, 1]) - ey * (b[j, 0] - a[k, 0]) > tolerance:
+                is_outside = False
                 break
-        if outside:
+        if is_outside:
             return True
     return False
 
@@ -621,7 +622,7 @@ def _measure_edges(polygon: Float, size: int, edge: Float) -> None:
 
 @borrowing
 def _crossing_distances(edge: Float, size: int, ux: float, uy: float) -> tuple[bool, float, float, float, float, float]:
-    # Inverse distances of entry and exit along u, as vectors g with 1/d = g·u; hit is False where the ray misses.
+    """Whether the ray u hits; entry distance; inverse distances of entry and exit as vectors g with 1/d = g·u."""
     enter, leave = -np.inf, np.inf
     front = back = -1
     hit = True
@@ -657,7 +658,7 @@ def _insert_sorted(values: Float, count: int, value: float) -> int:
 
 @callee
 def _insert_crossings(a: Float, na: int, b: Float, nb_: int, lo: float, hi: float, breaks: Float, count: int) -> int:
-    # The azimuths between lo and hi at which an edge of a crosses one of b go to the ascending breaks[:count].
+    """Adds to the ascending breaks[:count] azimuths from lo to hi where edges of a and b cross; returns the count."""
     for k in range(na):
         m = k + 1 if k + 1 < na else 0
         ex, ey = a[m, 0] - a[k, 0], a[m, 1] - a[k, 1]
@@ -694,7 +695,7 @@ def _visible_share(
     t: int, near: Int, span: Float, covered: Float, xy: Float, of: Any, eye_m: tuple[float, float, float], flat: bool,
     work: _Work,
 ) -> float:  # fmt: skip
-    # The share of target t that the bodies `near` leave visible: the open azimuths, column by column.
+    """The share of target t that bodies `near` leave visible: its open azimuths, integrated column by column."""
     breaks, splits, count = work.breaks, work.splits, len(near)
     lo, hi, oz = of[t].lo, of[t].hi, eye_m[2]
     breaks[0], breaks[1], n_breaks = lo, hi, 2
@@ -743,8 +744,9 @@ def _place_corners(
     i: int, b: int, turn: float, polygon: Float, of: Any, t: int, eye_m: tuple[float, float, float], count: int,
     work: _Work,
 ) -> int:  # fmt: skip
-    # Out: the corners and edges of body b, as the i-th in the frame of target t; those within the extent of the target
-    # go to the breaks. `turn`: of the body's bearing from the target's, −∞: unsure. Returns the number of breaks.
+    """Fills corners and edges of body b, the i-th, in the frame of target t; corners within its extent go to the
+    breaks. `turn`: of its bearing from the target's (rad), −∞: unsure. Returns the number of breaks.
+    """
     corner, lo, hi = work.corner, of[t].lo, of[t].hi
     cos, sin = np.cos(of[t].bearing), np.sin(of[t].bearing)
     for k in range(of[b].size):
@@ -761,8 +763,9 @@ def _place_corners(
 
 @nb.njit(inline="always")
 def _find_bodies_ahead(t: int, near: Int, span: Float, of: Any, flat: bool, ahead: Int) -> int:
-    # Out: the places of bodies that may cover a part of target t, neither surely beyond it nor surely below or above
-    # what can be seen of it. Returns their number.
+    """Fills `ahead` with places in `near` of bodies neither surely beyond target t nor surely below or above what is
+    visible of it. Returns their number.
+    """
     n = 0
     for i in range(len(near)):
         body = of[near[i]]
@@ -792,8 +795,9 @@ def _is_covered(angle: float, covered: Float) -> bool:
 def _find_covering_bodies(
     near: Int, ahead: Int, span: Float, of: Any, oz: float, columns: FaceColumns, flat: bool, work: _Work
 ) -> int:
-    # Bodies that cover a part of the columns between the azimuths a and b: how many, their slopes in `work.slope`.
-    # −1 where one of them covers all of it. Linear in u: what holds at both ends holds throughout.
+    """The number of bodies that cover a part of the columns from azimuth a to b, slopes in `work.slope`; −1: one covers
+    all. Linear in u: what holds at both ends holds throughout.
+    """
     a, b, cos_a, sin_a, cos_b, sin_b, ux, uy, face, tx, ty, z0, z1 = columns
     tx0, ty0, tx1, ty1 = z0 * tx, z0 * ty, z1 * tx, z1 * ty
     active = 0
@@ -840,7 +844,7 @@ def _find_covering_bodies(
 
 @borrowing
 def _split_azimuths(active: int, columns: FaceColumns, work: _Work) -> int:
-    # The azimuths from a to b between which no slope crosses another, nor an end of the column; how many.
+    """Fills `work.splits`: azimuths from a to b between which no slope crosses another or a column's end; how many."""
     a, b, tx, ty = columns.a, columns.b, columns.tx, columns.ty
     slope, splits = work.slope, work.splits
     cos_a, sin_a, cos_b, sin_b = columns.cos_a, columns.sin_a, columns.cos_b, columns.sin_b
@@ -870,8 +874,7 @@ def _split_azimuths(active: int, columns: FaceColumns, work: _Work) -> int:
 
 @nb.njit(inline="always")
 def _crosses_none(count: int, columns: FaceColumns, least: float, work: _Work) -> bool:
-    # Whether the slopes and the ends of the column surely have the same order at both azimuths, none nearer to the next
-    # than `least`: then none crosses another, which mostly is so.
+    """Whether slopes and column ends surely have one order at both azimuths, `least` apart, so that none crosses."""
     face_a = columns.tx * columns.cos_a + columns.ty * columns.sin_a
     face_b = columns.tx * columns.cos_b + columns.ty * columns.sin_b
     low, high, n = work.sorted[0], work.sorted[1], 0
@@ -894,7 +897,7 @@ def _crosses_none(count: int, columns: FaceColumns, least: float, work: _Work) -
 
 @nb.njit(inline="always")
 def _open_share(active: int, columns: FaceColumns, theta: float, work: _Work) -> float:
-    # The share of the column at one azimuth that is not covered: 1 less the union of the bodies' intervals.
+    """The share of the column at azimuth `theta` that is not covered: 1 less the union of the bodies' intervals."""
     slope, low, high, z0, height = work.slope, work.low, work.high, columns.z0, columns.z1 - columns.z0
     ux, uy = np.cos(theta), np.sin(theta)
     inverse = columns.tx * ux + columns.ty * uy

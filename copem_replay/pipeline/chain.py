@@ -59,16 +59,16 @@ def fuse_members(log: Replay, experiment: Experiment, group: RunGroup, *, entrie
 
 
 def _add_pose_errors(log: Replay, lists: Tracks, units: ExpandedExperiment, runs: Int) -> Tracks:
-    """The lists, those of units that fuse moved by the errors of their poses, about the place of the first member."""
+    """The lists, in which those of fusing units are shifted and turned by their pose error about their first member."""
     for name, unit in units.fusing.items():
         if unit.placed is None or unit.fuses is None:
             continue
         rows = np.flatnonzero(lists.row_unit_ix == lists.units.index(name))
         poses = compute_unit_poses(log.scene, units.units[unit.fuses[0]], log.truth, ground_m=0.0)
         if len(rows):  # then it is there at least once
-            times_s, there = lists.row_captured_s[rows], poses.present
-            places = (axis[there] for axis in (poses.x_m, poses.y_m))
-            at_m = np.stack([np.interp(times_s, log.truth.captured_s[there], place) for place in places])
+            times_s, is_present = lists.row_captured_s[rows], poses.present
+            places = (axis[is_present] for axis in (poses.x_m, poses.y_m))
+            at_m = np.stack([np.interp(times_s, log.truth.captured_s[is_present], place) for place in places])
             away_m = np.stack([lists.x_m[0, rows], lists.y_m[0, rows]]) - at_m
             lists = displace_rows(log.scene, lists, rows, at_m, away_m, unit.placed, (units.seed, name, runs))
     return lists
@@ -87,7 +87,7 @@ def _find_lists(name: str, schedule: FusionSchedule, stamp_ns: Int, scene: Scene
 
 
 def _list_fused(lists: Tracks, tracks: FusedTracks, scene: Scene) -> RecordedUnits:
-    """The fused lists of one run as the lists of a unit, with the object that each entry holds."""
+    """The fused lists of one run as a unit's recorded lists; each entry keeps the object that it holds."""
     fused, claims = tracks.fused, tracks.said
     rows = fused.by_frame[0][fused.valid[0, fused.by_frame[0]]]
     object_ix = fused.row_object_ix[rows]

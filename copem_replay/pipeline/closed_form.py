@@ -74,7 +74,9 @@ def find_lasting_detection(
 
 
 def _find_processes(experiment: ExpandedExperiment, name: str, hits: int) -> dict[str, tuple[str, float]]:
-    """By unit whose detection lasts: the key of the held number it uses, and its correlation time."""
+    """By unit with lasting detection: the key of the random number it uses, and its correlation time (s). Raises
+    ExperimentError: the exact distribution then has no closed form.
+    """
     configuration = experiment.configurations[name]
     processes: dict[str, tuple[str, float]] = {}
     for unit in () if configuration.units == TRUTH else experiment.units_of(configuration):
@@ -102,13 +104,13 @@ def _find_processes(experiment: ExpandedExperiment, name: str, hits: int) -> dic
 
 
 def _find_lasting_part(pem: Pem, name: str, unit: str) -> MemoryPart | None:
-    """The one part of a unit's detection that lasts; None: detection does not last."""
+    """The one lasting part of a unit's detection; None: nothing lasts. Raises ExperimentError: no closed form."""
     by_couple = [parts for c in range(len(pem.couples)) if (parts := _list_lasting_parts(pem, c))]
     if not by_couple:
         return None
-    most = max(by_couple, key=len)
-    if len(most) > 1:
-        count = f"{_count_in_words(len(most))} lasting parts"
+    longest_parts = max(by_couple, key=len)
+    if len(longest_parts) > 1:
+        count = f"{_count_in_words(len(longest_parts))} lasting parts"
         why = f"detection of unit {unit} has {count}, which has no closed form here; leave one"
         raise _refuse_lasting(name, why)
     [first, *others] = [parts[0] for parts in by_couple]
@@ -184,6 +186,7 @@ def receive_without_loss(replay: Replay, experiment: ExpandedExperiment, name: s
 
 
 def _check_link(unit_links: UnitLinks, link: Radio, name: str, hits: int) -> None:
+    """Raise ExperimentError where a link makes lists depend on each other or on draws: there is no closed form."""
     label = f"link {unit_links.where.removeprefix('links.')}"
     if link.latency.fixed_s is None:
         raise _refuse_link(
@@ -199,11 +202,11 @@ def _check_link(unit_links: UnitLinks, link: Radio, name: str, hits: int) -> Non
 
 
 def _reception_probability(replay: Replay, seen: Tracks, unit_links: UnitLinks, link: Radio, name: str) -> Float:
-    """(F,) the probability that each list arrives."""
+    """(F,) the probability that each list arrives. Raises ExperimentError for losses in bursts."""
     F = len(seen.stamp_ns)
     path = replay.paths if link.reception.by_path else None
-    nowhere = np.full(F, np.nan)
-    path = RadioPath(nowhere, nowhere) if path is None else RadioPath(path.distance_m[:F], path.visible_share[:F])
+    no_path = np.full(F, np.nan)
+    path = RadioPath(no_path, no_path) if path is None else RadioPath(path.distance_m[:F], path.visible_share[:F])
 
     noises: list[str] = []
 
@@ -336,7 +339,7 @@ def _find_lasting(
 
 
 def _number_shared_instants(replay: Replay, received: Tracks, name: str) -> Int:
-    """(F,) the capture instant of each list. Raises ExperimentError unless all units share all of them."""
+    """(F,) the capture instant of each list, numbered. Raises ExperimentError unless all units share all of them."""
     arrived = np.isfinite(received.common_arrives_s)
     if received.units != (TRUTH,) and (replay.expanded.share[received.frame_unit_ix[arrived]] < 1).any():
         raise ExperimentError(
@@ -367,7 +370,7 @@ def _number_shared_instants(replay: Replay, received: Tracks, name: str) -> Int:
 def _exact_columns(
     replay: Replay, experiment: Experiment, name: str, distributions: list[FirstKnown]
 ) -> dict[str, Any]:
-    """Columns of one configuration: a row per episode and instant, and one without an instant for never."""
+    """Columns of one configuration: for each episode a row by instant of detection, and a last one for never."""
     scene, episodes = replay.scene, replay.episodes
     episode = np.repeat(np.arange(len(distributions)), [len(d.time_s) + 1 for d in distributions])
 

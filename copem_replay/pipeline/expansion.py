@@ -106,9 +106,8 @@ def _is_fixed(experiment: Experiment, name: str, configuration: Configuration) -
 
 
 def _find_ideal(experiment: Experiment, configuration: Configuration) -> tuple[str | None, str | None]:
-    """The ideal fusion of a configuration's units or `inputs`, and which of the two it is of.
-
-    It has the same latency, link and `issue_hz`, if there is one so, else the same units.
+    """The ideal fusion to compare a configuration with, and what they share: its `inputs` (units, latency, link,
+    `issue_hz`) or only its `units`. None, None: there is none.
     """
     if configuration.recorded is None and isinstance(configuration.fusion, IdealFusion):
         return None, None
@@ -264,7 +263,7 @@ def expand_experiment(experiment: Experiment, scene: Scene) -> ExpandedExperimen
 
 
 def _expand_carriers(experiment: Experiment, scene: Scene) -> ExpandedExperiment:
-    """An experiment's units over one log, with one for every object that may carry one."""
+    """The experiment over one log, with a unit of its own for each object that may carry one."""
     units: dict[str, Unit] = {}
     named: list[str] = []
     carriers: list[str] = []
@@ -302,7 +301,9 @@ def expand_alike(experiment: Experiment, other: ExpandedExperiment) -> ExpandedE
 def _replace_units(
     experiment: Experiment, units: dict[str, Unit], named: tuple[str, ...], carrier: tuple[str, ...], share: Float
 ) -> ExpandedExperiment:
-    """An experiment with these units instead of its own, in `units` and in the configurations."""
+    """The experiment with `units` instead of its own, also in configurations. `named`, `carrier`, `share`: of each, its
+    name in the file, the object that carries it, and the share of runs that have it.
+    """
     expanded = experiment
     if units.keys() != experiment.units.keys():
         members = {n: [unit for unit, of in zip(units, named, strict=True) if of == n] for n in experiment.units}
@@ -371,7 +372,7 @@ def resolve_for_run(experiment: Experiment, scene: Scene, run: int) -> Experimen
 def _replace_members(
     configurations: dict[str, Configuration], members: dict[str, list[str]]
 ) -> dict[str, Configuration]:
-    """Configurations with units replaced by their `members`: in lists of units, and in latencies and links by unit."""
+    """Configurations in which each unit is replaced by its `members`: in `units`, `latency_s` and `link`."""
     result = {}
     for name, configuration in configurations.items():
         changed: dict[str, object] = {}

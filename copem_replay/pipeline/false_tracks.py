@@ -44,11 +44,11 @@ class FalseTracks:
         self._added = self._of_runs = 0
 
     def add(self, lists: ObjectLists, matches: Matches, now: Matches) -> None:
-        """Add the next lists, with the matches of their entries at the instant they tell of, and now."""
+        """Add the next lists; their false entries, by the matches at the instants told of and now, are kept."""
         false = (matches.role == GHOST) & (now.role == GHOST)
         rows = np.flatnonzero(false & self._measured_class[matches.class_ix])
-        place = np.searchsorted(lists.start.ravel(), rows, side="right") - 1
-        run_ix, list_ix = np.divmod(place, lists.start.shape[1])
+        list_number = np.searchsorted(lists.start.ravel(), rows, side="right") - 1
+        run_ix, list_ix = np.divmod(list_number, lists.start.shape[1])
         list_ix += self._added
         entries = take_entries(lists.entries, rows)
         keep = are_annotated(entries["x_m"], entries["y_m"], list_ix, self._reference, self._settings)
@@ -154,7 +154,7 @@ def _name_units(track: Int, unit_ix: Int, units: tuple[str, ...], tracks: int) -
 
 @borrowing_kernel
 def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Float, number: Int, newest: Int) -> None:
-    # Out: the track of each entry (N,), by run and list. `newest`: of each track its last entry so far.
+    """Fills `number (N,)`: the track of each entry, by run and list, nearest pairs first. `newest`: scratch."""
     n_tracks, oldest, first = 0, 0, 0
     while first < len(run_ix):
         after = first
@@ -164,9 +164,9 @@ def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Flo
             run_ix[newest[oldest]] != run_ix[first] or time_s[first] - time_s[newest[oldest]] > PAUSE_S + SAME_INSTANT_S
         ):
             oldest += 1
-        nearest, before = first, 0
-        while nearest >= 0:
-            least, nearest = NEAR_M * NEAR_M + 1e-9, -1
+        nearest_entry, nearest_track = first, 0
+        while nearest_entry >= 0:
+            least_square, nearest_entry = NEAR_M * NEAR_M + 1e-9, -1
             for i in range(first, after):
                 for t in range(oldest, n_tracks):
                     j = newest[t]
@@ -174,10 +174,10 @@ def _link_entries(run_ix: Int, list_ix: Int, time_s: Float, x_m: Float, y_m: Flo
                     if number[i] >= 0 or j >= first or run_ix[j] != run_ix[i] or too_late:
                         continue
                     square = (x_m[i] - x_m[j]) ** 2 + (y_m[i] - y_m[j]) ** 2
-                    if square < least:
-                        least, nearest, before = square, i, t
-            if nearest >= 0:
-                number[nearest], newest[before] = before, nearest
+                    if square < least_square:
+                        least_square, nearest_entry, nearest_track = square, i, t
+            if nearest_entry >= 0:
+                number[nearest_entry], newest[nearest_track] = nearest_track, nearest_entry
         for i in range(first, after):
             if number[i] < 0:
                 number[i], newest[n_tracks] = n_tracks, i

@@ -100,7 +100,7 @@ def measure_list_rates(replay: Replay, experiment: Experiment) -> dict[str, List
 
 
 def _measure_rate(lists: Transmission, name: str) -> ListRate:
-    """The rate of one configuration in one run."""
+    """The list rate of one configuration in one run: intervals, the time they cover (s), and times on links."""
     units, end_s = lists.experiment, lists.log.scene.end_s
     received = lists.received(name)
     issue_s = receiver_instants(received)
@@ -213,7 +213,7 @@ def study_notes(
 
 
 def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """A line for each log and note; a note that more than three logs have is one line."""
+    """A line for each (log, note); a note that more than `_NAMED` logs share is a single line."""
     pairs = list(dict.fromkeys(notes))
     logs_of: dict[str, list[str]] = {}
     for log, note in pairs:
@@ -229,17 +229,17 @@ def _group_by_log(notes: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _find_empty_classes(recordings: Sequence[KnownLog], experiment: Experiment) -> Iterator[str]:
-    """Measured classes that are named like their group and select nobody, though the group would: `vehicle`."""
+    """Notes on a measured class, such as `vehicle`, that no object has while its group, `vehicles`, has some."""
     selects, others = Counter[str](), Counter[str]()  # by class, all logs together: the measured objects, and the rest
     class_names: dict[str, None] = {}
     for recording in recordings:
         scene = recording.scene
         classes = resolve_for_log(experiment, scene.log).measure.objects.classes or ()
         class_names |= dict.fromkeys(classes)
-        there = scene.object_class[np.arange(len(scene.object_class)) != scene.ego_ix]
-        measured = np.isin(there, class_indices(classes))
-        selects.update(CLASSES[k] for k in there[measured])
-        others.update(CLASSES[k] for k in there[~measured])
+        object_classes = scene.object_class[np.arange(len(scene.object_class)) != scene.ego_ix]
+        measured = np.isin(object_classes, class_indices(classes))
+        selects.update(CLASSES[k] for k in object_classes[measured])
+        others.update(CLASSES[k] for k in object_classes[~measured])
     for group, members in CLASS_GROUPS.items():
         name, more = group.removesuffix("s"), ", ".join(f"{others[one]} {one}" for one in members if others[one])
         if name in class_names and name in CLASSES and not selects[name] and more:
@@ -281,9 +281,8 @@ def list_oddities(replay: Replay, experiment: Experiment, met: Bool | None = Non
 
 
 def _find_ignored_errors(experiment: Experiment) -> Iterator[str]:
-    """Configurations whose fusion ignores what units get wrong, or takes errors that hang together as independent.
-
-    Ideal fusion knows the true captures and ids although a clock is off, or a unit has ghosts.
+    """Notes on configurations whose fusion ignores errors of units (ideal fusion: clocks, ghosts), or takes dependent
+    errors as independent (a tracker on a tracker's lists).
     """
     for name, configuration in experiment.configurations.items():
         fusion, unit_names = configuration.fusion, experiment.units_of(configuration)
@@ -315,17 +314,17 @@ _DRAWS = (1e-9, 0.5, 1 - 1e-9)
 
 
 def _find_dead_links(replay: Replay, experiment: Experiment) -> Iterator[str]:
-    """Links that lose all lists of a unit, whatever is drawn."""
+    """Notes on links by which no list of a unit can arrive, whatever is drawn."""
     units = replay.expand(experiment)
-    best_of: dict[tuple[str, str], float] = {}
+    best_reception: dict[tuple[str, str], float] = {}
     for name, configuration in units.configurations.items():
         members = units.units_of(configuration) or (TRUTH,)
         for hop in units.links_of(name):
             if isinstance(hop.link, Radio) and hop.link.loses:
                 senders = [unit for unit in members if hop.units is None or unit in hop.units]
                 for sender, best in _find_best_receptions(replay, units, hop.link.reception, senders, hop.where):
-                    best_of[hop.where, sender] = max(best, best_of.get((hop.where, sender), 0.0))
-    for (where, sender), best in best_of.items():
+                    best_reception[hop.where, sender] = max(best, best_reception.get((hop.where, sender), 0.0))
+    for (where, sender), best in best_reception.items():
         if best < _LOST:
             yield f"{where}: no list of {sender} arrives, its reception is {'at most ' * (best > 0)}{best:.1g}"
 
@@ -333,7 +332,7 @@ def _find_dead_links(replay: Replay, experiment: Experiment) -> Iterator[str]:
 def _find_best_receptions(
     replay: Replay, units: ExpandedExperiment, reception: ReceptionModel, senders: Sequence[str], where: str
 ) -> Iterator[tuple[str, float]]:
-    """Units that send by a link, by their names in the experiment, and the highest reception of any list of each."""
+    """The name in the experiment of each sending unit, and the highest reception probability of any of its lists."""
     named = dict(zip(units.units, units.named, strict=True))
     if not reception.by_path:
         best = _ask_best_reception(reception, RadioPath(np.full(1, np.nan), np.full(1, np.nan)), where)
@@ -392,7 +391,7 @@ def could_meet(replay: Replay) -> Bool:
 
 
 def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: int) -> bool:
-    """Whether any object of a world is where a condition holds, at a list that the unit makes."""
+    """Whether any object is ever where a couple of the PEM applies, at an instant at which the unit makes a list."""
     lists = np.flatnonzero(poses.present)
     order, bounds = world.by_frame
     if not len(lists):
@@ -400,13 +399,13 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: 
     rows = order[bounds[lists[0]] : bounds[lists[-1] + 1]]
     for examined in (rows[::_SAMPLE], rows):
         frame = world.frame_ix[examined]
-        kept = poses.present[frame] & (world.row_object_ix[examined] != carrier_ix)
-        examined, frame = examined[kept], frame[kept]
+        is_seen = poses.present[frame] & (world.row_object_ix[examined] != carrier_ix)
+        examined, frame = examined[is_seen], frame[is_seen]
         dx_m, dy_m = world.x_m[0, examined] - poses.x_m[frame], world.y_m[0, examined] - poses.y_m[frame]
-        bearing_rad, none = np.arctan2(dy_m, dx_m), np.zeros(len(examined))
+        bearing_rad, zeros = np.arctan2(dy_m, dx_m), np.zeros(len(examined))
         view = ViewGeometry(
-            np.hypot(dx_m, dy_m), wrap_angles(bearing_rad - poses.heading_rad[frame]), bearing_rad, none,
-            scene.object_class[world.row_object_ix[examined]], none, none, none, none, none,
+            np.hypot(dx_m, dy_m), wrap_angles(bearing_rad - poses.heading_rad[frame]), bearing_rad, zeros,
+            scene.object_class[world.row_object_ix[examined]], zeros, zeros, zeros, zeros, zeros,
         )  # fmt: skip
         if may_apply(pem.couples, view, scene.tags).any():
             return True
@@ -414,7 +413,7 @@ def _meets(pem: Pem, scene: Scene, world: Tracks, poses: UnitPoses, carrier_ix: 
 
 
 def _find_far_units(replay: Replay, experiment: Experiment) -> Iterator[str]:
-    """Units whose place is far from all objects."""
+    """Notes on units whose place is farther than `FAR_M` from all objects: probably a wrong coordinate."""
     x_m, y_m = replay.truth.x_m[0], replay.truth.y_m[0]
     if not len(x_m):
         return
@@ -432,7 +431,7 @@ def _find_far_units(replay: Replay, experiment: Experiment) -> Iterator[str]:
 
 
 def _find_idle_units(replay: Replay, experiment: Experiment, met: Bool) -> Iterator[str]:
-    """Units that list nothing in any run: those of one fleet in one line."""
+    """Notes on units that list nothing in any run, a line a fleet; `met`: by unit whether its PEM ever applies."""
     expanded = replay.expanded
     modelled = dict(zip(expanded.modelled, met.tolist(), strict=True))
     of_name = list(zip(expanded.named, expanded.units, strict=True))
@@ -456,7 +455,7 @@ def _count_carriers(unit_names: list[str], members: list[str]) -> str:
 
 
 def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]:
-    """Why a log gives no rows, or no verdicts."""
+    """Notes on why a log gives no rows or no verdicts, and on objects left out or returning."""
     scene, measure, episodes = replay.scene, experiment.measure, replay.episodes
     within, outside = measure.objects.within, len(replay.outside_ix)
     if within is not None and outside:
@@ -488,7 +487,7 @@ def _explain_unmeasured(replay: Replay, experiment: Experiment) -> Iterator[str]
 
 
 def _find_returns(replay: Replay) -> Iterator[str]:
-    """Objects that come back to the condition, of which only the first episode counts."""
+    """A note on objects that come back to the condition, if only their first episode counts; else none."""
     returning = np.flatnonzero(replay.episodes.returns)
     if not len(returning):
         return

@@ -76,6 +76,7 @@ class RunTracks:
         return next(self._compute())
 
     def _compute(self) -> Iterator[RunChunk]:
+        """By chunk: the fused tracks of this run by configuration, and a function that gives its units' lists."""
         replay, measure = self.replay, self.experiment.measure
         units = replay.expand(self.experiment)
         [group] = group_runs(units, replay.scene.log, np.array([self.run]))
@@ -159,7 +160,7 @@ def _find_fields(world: WorldChunk, name: str, stamp_ns: Int) -> tuple[list[Floa
 def _make_unit_tracks(
     world: WorldChunk, name: str, frames: Int, start: Int, entries: Entries, rows: Int, stated: StatedCaptures | None
 ) -> FusedTracks:
-    """The entries (P,) of some lists of a unit as tracks, each one of its own; `rows (P,)`: of what units send."""
+    """The entries (P,) of a unit's lists as tracks of one entry each; `rows (P,)`: their rows in what units send."""
     sent, frame_ix, claims = world.sent("sampled"), np.repeat(np.arange(len(frames)), np.diff(start)), entries.copy()
     captured_s = (sent.captured_s if stated is None else stated.stated_s)[frames]
     age_s = 0.0 if sent.entry_age_s is None else sent.entry_age_s[0, rows]
@@ -231,7 +232,7 @@ def list_stems(experiment: Experiment) -> list[str]:
 
 
 def _rank_run(rows: pd.DataFrame, horizon_s: float, rank: str) -> tuple[int, str]:
-    """The run that is `median`, `worst` or `best` among the rows of a log, and why."""
+    """The run with `median`, `worst` or `best` summed time to detection among a log's rows, and a phrase on why."""
     if not len(rows):
         return 0, f"first, not {rank}, as no measured object has an onset"
     time_s = rows["time_to_detection_s"].fillna(horizon_s).clip(upper=horizon_s)

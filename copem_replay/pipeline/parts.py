@@ -214,6 +214,7 @@ def write_recipe(experiment: Experiment, name: str, log: Mapping[str, Any], runs
 
 @cache_last_experiment
 def _recipe_parts(experiment: Experiment, name: str) -> tuple[dict[str, Any], list[Component | MapFile]]:
+    """All settings that a part's rows depend on, and the components and maps whose content is hashed too."""
     data = experiment.as_written()
     configuration = experiment.configurations[name]
     units, members = _list_dependencies(experiment, configuration), experiment.units_of(configuration)

@@ -272,7 +272,7 @@ class Replay:
     @cached_property
     def _overview(self) -> tuple[SightSpans, Bool, int]:
         """`sight_spans`, `ever_met`, and the number of observation rows of objects that have an episode."""
-        changes, met, rows, units = [], list[Bool](), 0, list(self.sighted.modelled)
+        sight_changes, met_by_chunk, rows, units = [], list[Bool](), 0, list(self.sighted.modelled)
         viewing = give_views(self.expanded, alone=True)
         for chunk in self.chunks:
             observations = self.observe(chunk)
@@ -283,10 +283,10 @@ class Replay:
                 episode_ix = self.episodes.number_rows(seen.tracks)
                 changed = find_sight_changes(seen, experiment, self.scene.tags, episode_ix)
                 unit_ix = np.array([units.index(name) for name in seen.tracks.units], dtype=np.int64)
-                changes.append(changed._replace(unit_ix=unit_ix[changed.unit_ix]))
-            met.append(observations.ever_met)
+                sight_changes.append(changed._replace(unit_ix=unit_ix[changed.unit_ix]))
+            met_by_chunk.append(observations.ever_met)
             rows += int(np.isin(observations.tracks.row_object_ix, self.episodes.object_ix).sum())
-        return join_sight_changes(changes, self.episodes.onset_s), np.any(met, axis=0), rows
+        return join_sight_changes(sight_changes, self.episodes.onset_s), np.any(met_by_chunk, axis=0), rows
 
     @cached_property
     def truth_cache(self) -> TruthCache:
@@ -374,9 +374,10 @@ class Replay:
 
     @cached_property
     def paths(self) -> RadioPath:
-        """The radio path of each list (F,) of all units to the ego.
+        """The radio path of each list (F,), from its unit to the ego: distance (m) and visible share.
 
-        A list aboard the ego has distance 0, one of a recorded unit NaN, one without an observation of the ego ∞.
+        Distance 0: aboard the ego; ∞: no observation of the ego; NaN: a recorded unit. A unit that fuses has those of
+        its first member's list before.
         """
         if self.paths_of is not None:
             return self.paths_of.paths
@@ -391,11 +392,11 @@ class Replay:
         is_recorded = np.isin(senders, list(expanded.recorded))
         captured_s = self.recorded_lists.captured_s
         for name, unit in expanded.fusing.items():  # as far as its first member's list before
-            lists, own = np.flatnonzero(senders == name), np.flatnonzero(senders == (unit.fuses or ("",))[0])
-            place = np.searchsorted(captured_s[own], captured_s[lists] + SAME_INSTANT_S) - 1
-            before = own[np.maximum(place, 0)] if len(own) else lists
-            distance_m[lists], visible_share[lists] = distance_m[before], visible_share[before]
-            is_aboard[lists] = is_aboard[before]
+            lists, member_lists = np.flatnonzero(senders == name), np.flatnonzero(senders == (unit.fuses or ("",))[0])
+            place = np.searchsorted(captured_s[member_lists], captured_s[lists] + SAME_INSTANT_S) - 1
+            list_before = member_lists[np.maximum(place, 0)] if len(member_lists) else lists
+            distance_m[lists], visible_share[lists] = distance_m[list_before], visible_share[list_before]
+            is_aboard[lists] = is_aboard[list_before]
         distance_m[is_aboard], visible_share[is_aboard] = 0.0, 1.0
         distance_m[is_recorded] = visible_share[is_recorded] = np.nan
         return RadioPath(distance_m, visible_share)

@@ -114,8 +114,7 @@ def _fill_words(
     valid: Bool, order: Int, bounds: Int, states: Float, classes: NDArray[np.int8], source: EntrySources,
     start: Int, words: Float, ids: Int, row_object_ix: Int, object_ix: Int,
 ) -> None:  # fmt: skip
-    # Fills `words` (N, words of an entry) and `ids`, integers over the same memory, `object_ix`, run by run and list by
-    # list, and `start`. `states` are (12, S | 1, P).
+    """Fills `words` and `ids` (the same memory as numbers and integers), `object_ix` and `start`, by run and list."""
     n = 0
     for s in range(valid.shape[0]):
         start[s, 0] = n
@@ -148,8 +147,7 @@ class FusedOnce:
         return convert_to_lists(self.fused_tracks, self.fused_tracks.scene)
 
     def lists_arriving(self, received: Tracks) -> ListsWithIds | None:
-        """The fused lists, for inputs that arrive at other times; None: the first unit of an entry may differ.
-
+        """The fused lists, for the same inputs at other arrival times; None: the first unit of an entry may differ.
         Which list of two arrived first stays the same where all are later by one latency.
         """
         one_s, other_s = self.fused_tracks.received.common_arrives_s, received.common_arrives_s
@@ -159,8 +157,8 @@ class FusedOnce:
         later_s, instants_s = other_s[arrive] - one_s[arrive], np.unique(one_s[arrive])
         # Neither does rounding decide which two arrive together.
         before, after = (np.searchsorted(instants_s, instants_s + SAME_INSTANT_S + side_s) for side_s in (-1e-9, 1e-9))
-        alike = np.ptp(later_s) < 1e-10 and np.array_equal(before, after)
-        return self._lists if alike else None
+        same_order = np.ptp(later_s) < 1e-10 and np.array_equal(before, after)
+        return self._lists if same_order else None
 
 
 def convert_to_tracks(output: ReceiverOutput, run: int, matches: Matches) -> FusedTracks:
@@ -247,18 +245,17 @@ class StatedCaptures:
         return replace(fused, entries=entries)
 
     def _true_s(self, told_s: Float, issue_s: Float) -> Float:
-        """The true captures (N,) of entries that tell of stated ones: of those that had arrived, the last.
-
-        An entry that tells of no list's stated capture is taken at its word.
+        """The true captures (N,) of entries that tell of stated ones: of lists with this claim the last that had
+        arrived. An entry that tells of no list's stated capture is taken at its word.
         """
         stated_s, captured_s, arrives_s = self.told[:, np.lexsort((self.told[1], self.told[0]))]
         place: Int = np.searchsorted(stated_s, told_s + SAME_INSTANT_S, side="right") - 1
         while True:
-            stated = (place >= 0) & (stated_s[np.maximum(place, 0)] >= told_s - SAME_INSTANT_S)
-            early = stated & (arrives_s[np.maximum(place, 0)] > issue_s + SAME_INSTANT_S)
-            if not early.any():
-                return np.where(stated, captured_s[np.maximum(place, 0)], told_s)
-            place = np.where(early, place - 1, place)
+            is_stated = (place >= 0) & (stated_s[np.maximum(place, 0)] >= told_s - SAME_INSTANT_S)
+            is_too_early = is_stated & (arrives_s[np.maximum(place, 0)] > issue_s + SAME_INSTANT_S)
+            if not is_too_early.any():
+                return np.where(is_stated, captured_s[np.maximum(place, 0)], told_s)
+            place = np.where(is_too_early, place - 1, place)
 
 
 def state_captures(scene: Scene, received: Tracks, experiment: ExpandedExperiment, run: int) -> StatedCaptures | None:
@@ -381,10 +378,7 @@ class Receivers:
         return self._schedules[name].issue_s
 
     def fuse(self, world: WorldChunk, name: str) -> ReceiverOutput:
-        """The output of a configuration's receiver in a time chunk, from the lists that reach it.
-
-        Raises InputError where a fusion of the user's own fails.
-        """
+        """What a configuration's receiver makes of the lists that reach it. InputError: a user's fusion fails."""
         configuration = world.experiment.configurations[name]
         states = states_needed(configuration)
         sent = world.truth if states is None else world.sent(states)
@@ -406,10 +400,8 @@ class Receivers:
     # entries that partial messages leave out, what lists of equal captures share.
 
     def _find_faults(self, world: WorldChunk, name: str, received: Tracks, sent: Tracks) -> UnitFaults | None:
-        """Rows of ghosts and lists that outages leave out, in one run; None: no unit has ghosts or outages.
-
-        Ghosts are those that are fused, without those that came in before the chunk: these are told of in an earlier
-        list.
+        """Rows of ghosts, and which lists outages leave out, in one run; None: no unit has ghosts or outages. Only
+        ghosts that are fused, and that came in since the last list before the chunk.
         """
         configuration = world.experiment.configurations[name]
         ghosts = None if states_needed(configuration) == "expected" else world.ghosts
@@ -426,7 +418,7 @@ class Receivers:
         return UnitFaults(rows[came_s > earlier_s.max(initial=-np.inf)], not_made)
 
     def _find_origin(self, world: WorldChunk, name: str, received: Tracks, sent: Tracks) -> OriginLists:
-        """The lists that entries of a configuration may go back to: those that it receives, of a stack its inputs."""
+        """The lists that entries of a configuration may go back to: those received, or of a stack its inputs."""
         configuration = world.experiment.configurations[name]
         age_s, partial = configuration.max_age_s, _mark_partial(world.experiment, received)
         if not isinstance(configuration.fusion, RecordedFusion):
@@ -441,7 +433,7 @@ class Receivers:
         return OriginLists(replace(inputs, arrives_s=taken_s[None]), inputs, GoesBack.TO_ALL, age_s, partial, -1)
 
     def _fuse_lists(self, world: WorldChunk, name: str, fusion: ListFusion, output: ReceiverOutput) -> ReceiverOutput:
-        """Fusion of lists without truth ids, told of the captures that units state."""
+        """The output with lists fused without truth ids, by the captures that units state, and their origin."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
         lists, object_of, _ = remove_truth_ids(world)
         captures, captured_s = self._state_captures(received), None
@@ -478,7 +470,7 @@ class Receivers:
         )
 
     def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> ReceiverOutput:
-        """Ideal fusion, or the truth itself, at the instants of the configuration."""
+        """The output with tracks of ideal fusion, or of the truth, at the configuration's instants."""
         fusion, received = world.experiment.configurations[name].fusion, output.received
         fused_once = self._fuse_once(name, output)
         fused_tracks = fused_once.fused_tracks.arriving(received, output.instants.issue_s)
@@ -493,19 +485,19 @@ class Receivers:
         return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
 
     def _fuse_once(self, name: str, output: ReceiverOutput) -> FusedOnce:
-        """What ideal fusion makes of lists. Later lists of the same captures, as in a sweep, are fused once."""
+        """What ideal fusion makes of the lists; cached, for a sweep fuses lists of equal captures at many latencies."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
         partial, cached = output.origin.partial, None
         if partial.any():
             cached = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
-        beside = find_lists_beside_newest(received, instants, cached)
-        parts = (instants.newest, *beside, *(() if cached is None else [cached.entry]))
-        captures, last = b"".join(part.tobytes() for part in parts), self._last_fused
-        if last is None or last.sent is not output.sent or last.captures != captures:
+        beside_newest = find_lists_beside_newest(received, instants, cached)
+        parts = (instants.newest, *beside_newest, *(() if cached is None else [cached.entry]))
+        captures, last_fused = b"".join(part.tobytes() for part in parts), self._last_fused
+        if last_fused is None or last_fused.sent is not output.sent or last_fused.captures != captures:
             ego = output.scene.ego_ix
             fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=ego, instants=instants, cached=cached)
-            self._last_fused = last = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
-        return last
+            self._last_fused = last_fused = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
+        return last_fused
 
 
 def _mark_partial(experiment: ExpandedExperiment, received: Tracks) -> Bool:

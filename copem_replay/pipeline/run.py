@@ -112,6 +112,7 @@ class Gatherer:
     def _begin_blocks(
         self, logs: Sequence[StudyLog], experiment: Experiment, pool: Executor, reading: Executor
     ) -> Iterator[_Computing]:
+        """The blocks of runs of each log, with parts from the cache; jobs for the missing ones are submitted."""
         for log in logs:
             local = resolve_for_log(experiment, log.name)
             log.facts(experiment)  # while the log is in memory
@@ -119,9 +120,9 @@ class Gatherer:
                 return_memory()
             blocks = cut_parts(local.runs, log.object_states)
             for runs in blocks:
-                have = self._read_parts(log, local, runs, reading)
-                names, missing, outcomes = [name for name in have if have[name] is None], local, []
-                if len(names) < len(have):
+                cached_parts = self._read_parts(log, local, runs, reading)
+                names, missing, outcomes = [name for name in cached_parts if cached_parts[name] is None], local, []
+                if len(names) < len(cached_parts):
                     missing = local.model_copy(update={"configurations": {n: local.configurations[n] for n in names}})
                 if names:
                     replay, workers = log.replay(), -(-self._jobs // len(blocks))
@@ -129,12 +130,12 @@ class Gatherer:
                         pool.submit(call_in_room, replay_outcomes, replay, missing, some)
                         for some in cut_blocks(replay, missing, workers, runs)
                     ]
-                yield _Computing(log, runs, runs == blocks[-1], have, missing, outcomes)
+                yield _Computing(log, runs, runs == blocks[-1], cached_parts, missing, outcomes)
 
     def _read_parts(
         self, log: StudyLog, local: Experiment, runs: tuple[int, int], reading: Executor
     ) -> dict[str, PartTables | None]:
-        """The parts of a block that are kept, by configuration; None: missing."""
+        """By configuration its cached part of a block of runs; None: it has to be computed."""
         cache, names = self._cache, list(local.configurations)
         if cache is None:
             return dict.fromkeys(names)
@@ -142,16 +143,16 @@ class Gatherer:
         def read(name: str) -> PartTables | None:
             return cache.read(write_recipe(local, name, log.identity, runs), log.name, name)
 
-        have = dict(zip(names, (reading.map if is_url(cache.address) else map)(read, names), strict=True))
-        cache.found += sum(part is not None for part in have.values())
-        return have
+        cached_parts = dict(zip(names, (reading.map if is_url(cache.address) else map)(read, names), strict=True))
+        cache.found += sum(part is not None for part in cached_parts.values())
+        return cached_parts
 
     def _finish_block(self, block: _Computing) -> Iterable[PartTables]:
-        """Wait for the missing parts of a block, keep them, and return all its parts."""
+        """Wait for the missing parts of a block, add them to the cache, and return all its parts."""
         log, known_parts, outcomes = block.log, block.kept, list[BlockOutcome]()
         for future in block.outcomes:
-            outcomes += (done := future.result())
-            self._advance(sum(len(outcome.runs) for outcome in done))
+            outcomes += (finished := future.result())
+            self._advance(sum(len(outcome.runs) for outcome in finished))
         if block.is_last:
             log.drop()
         if not outcomes:
@@ -170,7 +171,7 @@ class Gatherer:
         return [part for part in known_parts.values() if part is not None]
 
     def exact(self, log: StudyLog, experiment: Experiment) -> pd.DataFrame:
-        """The rows of `exact.parquet` of a log."""
+        """The exact detection times of a log (`exact.parquet`), by configuration from the cache or computed."""
         local, cache, rows = resolve_for_log(experiment, log.name), self._cache, list[pa.Table]()
         for name, configuration in local.configurations.items():
             recipe, part = "", None
@@ -267,6 +268,7 @@ class StudyTables:
         self._parts.setdefault(part.log, {}).setdefault(part.configuration, []).append(part.again or self._store(part))
 
     def _store(self, part: PartTables) -> Callable[[], PartTables]:
+        """Write a part to a temporary file; returns the function that reads it again. Raises OutputError: no room."""
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -368,6 +370,7 @@ def run_experiment(
 
 
 def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gatherer) -> StudyTables:
+    """All tables of a study: rows, summary, groups, sweep and bands, with the horizon that is used and notes."""
     study = _gather_study(logs, experiment, gatherer, reread=True)
     measure = experiment.measure
     study.horizon_s, horizon_notes = settle_horizon(select_counted(study.tally, measure.began), measure.horizon_s)
@@ -383,7 +386,7 @@ def _run_study(experiment: Experiment, logs: Sequence[StudyLog], gatherer: Gathe
 
 
 def _gather_study(logs: Sequence[StudyLog], experiment: Experiment, gatherer: Gatherer, *, reread: bool) -> StudyTables:
-    """Gather all logs, one after the other, with their tally and sums. `reread`: rows are needed again."""
+    """The tables of all logs, one log after the other, with tally and sums; `reread`: rows are read again later."""
     study, measure = StudyTables(experiment, tuple(logs), reread), experiment.measure
     if measure.exact:
         study.exact = pd.concat([gatherer.exact(log, experiment) for log in logs], ignore_index=True)
@@ -456,7 +459,7 @@ def _summarise_point(point: SweepPoint, logs: Sequence[StudyLog], gatherer: Gath
 
 
 def _summarise(study: StudyTables, horizon_s: float) -> tuple[pd.DataFrame, list[str]]:
-    """The rows of a summary, and notes about them."""
+    """The rows of `summary.csv`, one by configuration, and notes for the user about them."""
     experiment, facts, exact = study.experiment, study.facts, study.exact
     measure, names = experiment.measure, list(experiment.configurations)
     times = {name: join_list_rates(fact.times[name] for fact in facts if name in fact.times) for name in names}

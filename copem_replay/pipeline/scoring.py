@@ -76,7 +76,7 @@ def _interpolate_told_world(cache: TruthCache, output: ReceiverOutput) -> Tracks
 
 
 def _list_captures(output: ReceiverOutput) -> Float:
-    """Captures, ascending: all that were received; in a time chunk those about the captures that entries name."""
+    """Ascending captures (s) of received lists; in a time chunk only those beside captures that entries tell of."""
     received = output.received
     captures: Float = np.unique(
         np.append(received.captured_s, () if received.entry_age_s is None else received.entry_captured_s)
@@ -131,9 +131,8 @@ class Judge:
             )
 
     def match(self, cache: TruthCache, output: ReceiverOutput) -> tuple[Matches, Matches] | None:
-        """Matches of the lists of a time chunk, whose truth is in `cache`; None: matches are not needed.
-
-        At the instants that entries tell of, and for accuracy at those at which their lists are available.
+        """Matches of a chunk's entries with the truth: at the instants they tell of, and when lists are available (for
+        accuracy; else the same). None: not needed.
         """
         if not self._matches:
             return None
@@ -146,7 +145,7 @@ class Judge:
         return matches, matches
 
     def measure(self, cache: TruthCache, output: ReceiverOutput, pair: tuple[Matches, Matches] | None) -> None:
-        """Add the lists of a time chunk, with the result of `match`."""
+        """Add a chunk's lists to all measures; `pair`: from `match`, None: only what needs no matches."""
         issue_s = output.instants.issue_s
         if pair is not None:
             lists, (matches, now) = output.lists, pair
@@ -173,7 +172,7 @@ class Judge:
             self._conflicts.next(issue_s)
 
     def _begin(self, cache: TruthCache, output: ReceiverOutput) -> None:
-        """Begin with the first lists, which have the runs of all."""
+        """Set up the measures that need matches, at the first lists, which have the runs of all."""
         measure, episodes, runs = self._measure, self._log.episodes, len(output.lists.start)
         turns = number_turns(output.origin.lists) if measure.confirm.hits > 1 else None
         self._known = [
@@ -211,7 +210,7 @@ class Judge:
         return ConfigurationScores(self._issue_s, detections, steps, accuracy, held, needless, false)
 
     def _join_known(self) -> tuple[FirstDetections, DetectionSteps]:
-        """The detections of all episodes, and their steps in the order of runs and episodes."""
+        """The first detections of all episodes, joined over passes, and their steps by run and episode."""
         results = [known.result() for known in self._known]
         detections = FirstDetections(
             *(self._log.episodes.join_passes(columns) for columns in zip(*(one for one, _ in results), strict=True))

@@ -233,7 +233,7 @@ def find_looked_at(replay: Replay, sight: Sight, object_ix: int, curves: Mapping
 
 
 def _known_shares(sight: Sight, experiment: Experiment, observed: Observations | None, t0_ns: int) -> Float:
-    """(U, K, M) visible shares of observations captured exactly at frames of the truth, NaN elsewhere."""
+    """(U, K, M) visible shares observed exactly at frames of the truth; NaN: not observed there, still to compute."""
     shares = np.full(sight.share.shape, np.nan)
     if observed is None or not len(sight.object_ix):
         return shares
@@ -252,7 +252,7 @@ def _known_shares(sight: Sight, experiment: Experiment, observed: Observations |
 def _compute_part(
     replay: Replay, experiment: Experiment, sight: Sight, known_shares: Float, part: slice, centres: np.ndarray
 ) -> None:
-    """Fill the part of `sight` at some of the frames, from all units."""
+    """Fill `sight` at the frames of `part`: place, range, visible share and state of each unit, and what hides."""
     scene, shown = replay.scene, sight.object_ix.tolist()
     world = _world_at_frames(replay, experiment, sight.elapsed_ns[part])
     rows, column = _shown_rows(world, shown)
@@ -270,12 +270,12 @@ def _compute_part(
             in_field = may_apply(pem, view, scene.tags)
             sight.in_range[u, frame, column] = _is_in_range(pem, view)
         sight.place_m[u, part] = np.stack([poses.x_m, poses.y_m, poses.z_m], axis=-1)
-        known = np.where(in_field, known_shares[u, frame, column], 0.0)
-        share = _visible_shares(replay, experiment, unit, poses, world, rows, known)
+        known_in_field = np.where(in_field, known_shares[u, frame, column], 0.0)
+        share = _visible_shares(replay, experiment, unit, poses, world, rows, known_in_field)
         sight.share[u, frame, column] = share = np.where(in_field, share, np.nan)
         state = judge_sight(str(unit.pem), experiment, replace(view, visible_share=share), scene.tags)
-        there = poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != find_carrier(scene, unit))
-        sight.state[u, frame, column] = np.where(there, state, NO_UNIT)
+        is_there = poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != find_carrier(scene, unit))
+        sight.state[u, frame, column] = np.where(is_there, state, NO_UNIT)
         _find_hiders(replay, experiment, unit, poses, sight, u, part, centres)
 
 
@@ -292,16 +292,16 @@ def _unit_poses(replay: Replay, name: str, unit: Unit, world: Tracks) -> UnitPos
 def _visible_shares(
     replay: Replay, experiment: Experiment, unit: Unit, poses: UnitPoses, world: Tracks, rows: Int, known_shares: Float
 ) -> Float:
-    """(P,) visible shares of rows of the world: the known ones, and all others computed."""
+    """(P,) visible shares of rows of the world as this unit has them: the known ones, and all others computed."""
     carrier_ix = find_carrier(replay.scene, unit)
     lacks = np.isnan(known_shares) & poses.present[world.frame_ix[rows]] & (world.row_object_ix[rows] != carrier_ix)
     if not lacks.any():
         return known_shares
     watching = make_observers([poses], np.array([carrier_ix]))
-    near, rows = _keep_near_lines(world, poses, rows, lacks, experiment.visibility)
-    needed = np.zeros((1, len(near.frame_ix)), dtype=bool)
+    near_world, rows = _keep_near_lines(world, poses, rows, lacks, experiment.visibility)
+    needed = np.zeros((1, len(near_world.frame_ix)), dtype=bool)
     needed[0, rows[lacks]] = True
-    [share] = visible_shares(near, replay.placed.static, watching, experiment.visibility, needed)
+    [share] = visible_shares(near_world, replay.placed.static, watching, experiment.visibility, needed)
     return np.where(lacks, share[rows], known_shares)
 
 
@@ -310,15 +310,15 @@ def _keep_near_lines(
 ) -> tuple[Tracks, Int]:
     """The world without bodies that cannot hide any `needed` row from the unit, and the indices of `rows` in it.
 
-    A body hides nothing of a target if it is farther from the line between unit and target than both radii together. A
-    visibility model of the user's own gets the whole world.
+    A body hides nothing if it is farther from the line between unit and target than both radii together. A user's
+    visibility model gets the whole world.
     """
     if is_own(type(model)):
         return world, rows
     radius_m = np.hypot(world.length_m[0], world.width_m[0]) / 2
     order, bounds = world.by_frame
-    near = np.zeros(len(world.frame_ix), dtype=bool)
-    near[rows] = True
+    may_hide = np.zeros(len(world.frame_ix), dtype=bool)
+    may_hide[rows] = True
     targets = rows[needed & poses.present[world.frame_ix[rows]]]
     frames = world.frame_ix[targets]
     count = np.diff(bounds)[frames]
@@ -328,8 +328,8 @@ def _keep_near_lines(
     tx, ty = world.x_m[0, target] - ux, world.y_m[0, target] - uy
     ox, oy = world.x_m[0, body] - ux, world.y_m[0, body] - uy
     along = np.clip((ox * tx + oy * ty) / np.maximum(tx * tx + ty * ty, 1e-12), 0.0, 1.0)
-    near[body[np.hypot(ox - along * tx, oy - along * ty) <= radius_m[target] + radius_m[body] + 1e-6]] = True
-    return world.take_rows(np.flatnonzero(near)), np.cumsum(near)[rows] - 1
+    may_hide[body[np.hypot(ox - along * tx, oy - along * ty) <= radius_m[target] + radius_m[body] + 1e-6]] = True
+    return world.take_rows(np.flatnonzero(may_hide)), np.cumsum(may_hide)[rows] - 1
 
 
 def _world_at_frames(replay: Replay, experiment: Experiment, elapsed_ns: Int) -> Tracks:
@@ -348,17 +348,14 @@ def _find_hiders(
     replay: Replay, experiment: Experiment, unit: Unit, poses: UnitPoses, sight: Sight, u: int, part: slice,
     centres: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill `body_ix` and `body_m` of `sight` for unit u, at the frames of the `part` at which it has a hidden object.
-
-    `poses`: of the unit at the frames of the `part`.
-    """
-    hidden = np.flatnonzero((sight.state[u, part] == HIDDEN).any(axis=1))
-    if not len(hidden):
+    """Fill `body_ix`, `body_m` of `sight` for unit u where it has a hidden object in `part`; `poses`: of its frames."""
+    hidden_frames = np.flatnonzero((sight.state[u, part] == HIDDEN).any(axis=1))
+    if not len(hidden_frames):
         return
-    frames = part.start + hidden
+    frames = part.start + hidden_frames
     world = _world_at_frames(replay, experiment, sight.elapsed_ns[frames])
     poses_then = UnitPoses(
-        *(getattr(poses, name)[hidden] for name in ("x_m", "y_m", "z_m", "heading_rad", "present", "ground_m"))
+        *(getattr(poses, name)[hidden_frames] for name in ("x_m", "y_m", "z_m", "heading_rad", "present", "ground_m"))
     )
     watching = make_observers([poses_then], np.array([find_carrier(replay.scene, unit)]))
     rows, column = _shown_rows(world, sight.object_ix.tolist())

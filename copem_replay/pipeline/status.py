@@ -162,9 +162,8 @@ def _find_best_unit(sight: Sight, units: list[int], m: int, present: Bool, statu
 
 
 def _find_object_lists(lists: Tracks, unit: int, object_ix: int, issued_ns: Float) -> tuple[Int, Float, Int]:
-    """Captures of a unit's lists that hold an object and when these are taken in (K,), captures (F,) of all, in ns.
-
-    In order of capture; a lost list is taken in at inf. `issued_ns`: instants of fused lists, and inf.
+    """Captures of the unit's lists that hold the object, and when they are taken in (K,), by capture; captures (F,) of
+    all. All in ns; a lost list is taken in at inf. `issued_ns`: instants of fused lists, and inf.
     """
     rows = np.flatnonzero((lists.row_object_ix == object_ix) & (lists.row_unit_ix == unit) & lists.valid[0])
     frames = np.unique(lists.frame_ix[rows])
@@ -179,7 +178,7 @@ def _find_object_lists(lists: Tracks, unit: int, object_ix: int, issued_ns: Floa
 def _find_instants(
     sight: Sight, fused: Tracks, listed: list[list[tuple[Int, Float, Int]]], clock: EpisodeClocks, end_ns: int
 ) -> Int:
-    """(K,) instants of frames with a shown object and the next frames, captures, arrivals, onsets, detections."""
+    """(K,) ascending instants (ns) at which a status may change: frames, captures, arrivals, onsets, detections."""
     captured = [captured_ns for of_object in listed for captured_ns, _, _ in of_object]
     rows = np.isin(fused.row_object_ix, sight.object_ix) & fused.valid[0]
     frames = np.unique(fused.frame_ix[rows])
@@ -187,11 +186,11 @@ def _find_instants(
     gone = sight.elapsed_ns[
         np.flatnonzero(np.diff(sight.elapsed_ns, append=0) > 1.5 * _frame_period_ns(sight.elapsed_ns))
     ]
-    after = [gone + _frame_period_ns(sight.elapsed_ns), sight.elapsed_ns[-1:] + _frame_period_ns(sight.elapsed_ns)]
-    after = [np.minimum(instant, end_ns) for instant in after]
+    ends = [gone + _frame_period_ns(sight.elapsed_ns), sight.elapsed_ns[-1:] + _frame_period_ns(sight.elapsed_ns)]
+    ends = [np.minimum(instant, end_ns) for instant in ends]
     clocks_ns = np.concatenate([clock.onset_ns[sight.object_ix], clock.known_ns[sight.object_ix]])
     clocks_ns = clocks_ns[clocks_ns != NEVER_NS]
-    return np.unique(np.concatenate([sight.elapsed_ns, *after, *captured, available, clocks_ns]).astype(np.int64))
+    return np.unique(np.concatenate([sight.elapsed_ns, *ends, *captured, available, clocks_ns]).astype(np.int64))
 
 
 def _frame_period_ns(elapsed_ns: Int) -> int:
@@ -220,8 +219,7 @@ def _find_newest(captured_ns: Int, stamps_ns: Int, statuses: Status) -> tuple[Bo
 def _mark_under_way(
     captured_ns: Int, arrives_ns: Float, stamps_ns: Int, unit: int, m: int, rows: Bool, statuses: Status
 ) -> None:
-    """Fill `rows` of column m of `statuses` where a list of one unit with the object is lost, under way or unmatched.
-
+    """Fill `rows` of column m of `statuses` where a unit's list with the object is lost, under way or unmatched.
     `arrives_ns`: when it is taken in.
     """
     if not len(captured_ns):
@@ -234,13 +232,13 @@ def _mark_under_way(
     sent = np.searchsorted(captured_ns[travels], now, side="right")
     arrivals = np.sort(arrives_ns[travels])
     arrived = np.searchsorted(arrivals, now, side="right")
-    left_s = (np.append(arrivals, np.inf)[arrived] - statuses.elapsed_ns) * 1e-9
-    soonest = rows & (sent > arrived) & ~(statuses.until_s[:, m] <= left_s)
-    soonest &= statuses.status[:, m] < UNMATCHED
-    statuses.status[soonest, m], statuses.unit_ix[soonest, m], statuses.until_s[soonest, m] = (
+    remaining_s = (np.append(arrivals, np.inf)[arrived] - statuses.elapsed_ns) * 1e-9
+    is_soonest = rows & (sent > arrived) & ~(statuses.until_s[:, m] <= remaining_s)
+    is_soonest &= statuses.status[:, m] < UNMATCHED
+    statuses.status[is_soonest, m], statuses.unit_ix[is_soonest, m], statuses.until_s[is_soonest, m] = (
         UNDER_WAY,
         unit,
-        left_s[soonest],
+        remaining_s[is_soonest],
     )
     if travels.any():
         # An arrived list is the newest until a list captured later has been on its way for as long.
@@ -254,7 +252,7 @@ def _mark_under_way(
 def _mark_held(
     fused_tracks: FusedTracks, object_ix: int, m: int, clock: EpisodeClocks, counts_ns: int, statuses: Status
 ) -> None:
-    """Fill column m of `statuses` where the receiver's newest list holds the object, from `counts_ns` on a new one."""
+    """Fill column m of `statuses` where the newest list holds the object: early, unconfirmed, known or too late."""
     fused = fused_tracks.fused
     row_of = np.full(len(fused.stamp_ns) + 1, -1)  # the element more, index −1: no list yet
     rows = np.flatnonzero((fused.row_object_ix == object_ix) & fused.valid[0])
@@ -264,16 +262,16 @@ def _mark_held(
     row = row[held_at]
     captured_s = fused_tracks.captured_s[0, row]
     statuses.age_of_information_s[held_at, m] = statuses.elapsed_ns[held_at] * 1e-9 - captured_s
-    gone = np.isnan(statuses.body["x_m"][held_at, m])  # absent: the fused position is used
+    is_absent = np.isnan(statuses.body["x_m"][held_at, m])  # absent: the fused position is used
     for name, values in statuses.body.items():
-        values[held_at[gone], m] = getattr(fused, name)[0, row[gone]]
+        values[held_at[is_absent], m] = getattr(fused, name)[0, row[is_absent]]
     too_late = elapsed_ns(fused)[fused.frame_ix[row]] - SAME_INSTANT_NS > clock.ended_ns[object_ix]
     status = np.where(too_late, TOO_LATE, UNCONFIRMED)
-    early = captured_s * 1e9 < counts_ns
-    status[early] = EARLY
+    is_early = captured_s * 1e9 < counts_ns
+    status[is_early] = EARLY
     status[statuses.elapsed_ns[held_at] >= clock.known_ns[object_ix]] = KNOWN
-    counting = ~early | (statuses.elapsed_ns[held_at] < counts_ns) | (status == KNOWN)
-    statuses.status[held_at[counting], m] = status[counting]
+    counts = ~is_early | (statuses.elapsed_ns[held_at] < counts_ns) | (status == KNOWN)
+    statuses.status[held_at[counts], m] = status[counts]
 
 
 def list_status_spans(

@@ -145,6 +145,7 @@ class StudyLog:
         return self._facts[1]
 
     def _find_facts(self, local: Experiment) -> LogFacts:
+        """The facts of this log: from the cache if it has them for this recording, else of the replayed log."""
         if self.parts is None:
             return LogFacts.of(self.whole(), self.replay(), local)
         recording = self.recording
@@ -283,9 +284,8 @@ class LogSurvey:
         return None if self.parts is None else recall_log(self.parts, place, experiment, read)
 
     def kept(self, recording: Recording, experiment: Experiment, read: Callable[[], Recording]) -> KnownLog:
-        """The log of a recording in the experiment resolved for it: with all content, or without truth and lists.
-
-        Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
+        """The log of a recording, with its content, or without truth and lists once many are in memory (`read` gets it
+        again). Its SHA-256 is taken now, while its files are what was read. Raises ExperimentError, RecordingError.
         """
         recording = replace(recording, sha256=read_content_digest(recording))
         if not self._states or self._states + recording.object_states <= STATES_HELD:

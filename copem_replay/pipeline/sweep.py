@@ -156,7 +156,7 @@ def _reduce_measure(experiment: Experiment) -> Measure:
 def _sweep_configurations(
     experiment: Experiment, kind: str, values: tuple[float, ...]
 ) -> dict[str, tuple[Configuration | None, ...]]:
-    """Each configuration at each value; None: it has no such value, as a number of units that it does not hear."""
+    """By name each configuration at each value; None: it has no such value. Of equal ones only the first."""
     curves: dict[str, tuple[Configuration | None, ...]] = {}
     assert experiment.sweep is not None
     chosen = experiment.sweep.chosen(kind)
@@ -173,6 +173,7 @@ def _sweep_configurations(
 
 
 def _is_concerned(experiment: Experiment, configuration: Configuration, kind: str) -> bool:
+    """Whether a configuration changes with the swept quantity `kind`, such as `units` or `rate_hz`."""
     units = [experiment.units[name] for name in experiment.units_of(configuration)]
     if kind == "units":
         return any(not _is_ego(unit) for unit in units)
@@ -199,6 +200,7 @@ def _is_ego(unit: Unit) -> bool:
 def _set_configuration(
     experiment: Experiment, configuration: Configuration, kind: str, value: float
 ) -> Configuration | None:
+    """The configuration with `value` for `latency_s`, `loss`, `burst_s` or `units`; None: it has fewer units."""
     if kind == "latency_s":
         by_unit = configuration.latency_s
         late = by_unit | {"default": value} if isinstance(by_unit, dict) else value
@@ -216,6 +218,7 @@ def _set_configuration(
 
 
 def _set_units(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, Unit]:
+    """The units with `value` for `rate_hz` or `penetration_rate`; other kinds change no unit."""
     if kind == "rate_hz":
         return {
             name: unit if unit.pem is None else unit.model_copy(update={"rate_hz": value})
@@ -232,6 +235,7 @@ def _set_units(units: Mapping[str, Unit], kind: str, value: float) -> dict[str, 
 
 
 def _set_pems(pems: Mapping[str, Pem], kind: str, value: float) -> dict[str, Pem]:
+    """The PEMs with `value` for `ghosts_in_list` or `correlation_s` of detection; other kinds change no PEM."""
     if kind == "ghosts_in_list":
         return {name: _set_ghosts(pem, value) for name, pem in pems.items()}
     if kind != "correlation_s":

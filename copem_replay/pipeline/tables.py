@@ -72,9 +72,9 @@ def _spread(values: np.ndarray, assessed: Bool) -> np.ndarray:
 
 
 def _row_columns(accuracy: Accuracy, assessed: Bool) -> dict[str, Any]:
-    """The figures of each row, (S · M,) each; NaN where nothing was matched, or the object came back."""
+    """The accuracy figures of each row, (S · M,) each; NaN: nothing was matched, or it is a later episode."""
     sums = _spread(accuracy.by_object, assessed).ravel()
-    first = np.tile(assessed, len(accuracy.by_object))
+    is_first = np.tile(assessed, len(accuracy.by_object))
 
     def mean(name: str, count: str = "pairs") -> Float:
         return np.where(sums[count] > 0, sums[name] / np.maximum(sums[count], 1), np.nan)
@@ -91,7 +91,7 @@ def _row_columns(accuracy: Accuracy, assessed: Bool) -> dict[str, Any]:
         "age_of_information_s": mean("age_of_information_s"),
         "identity_switches": np.where(sums["tracked"] > 0, sums["switches"], np.nan),
         "duplicates": sums["duplicates"],
-        "longest_gap_s": np.where(first, sums["longest_gap_s"], np.nan),
+        "longest_gap_s": np.where(is_first, sums["longest_gap_s"], np.nan),
     }
 
 
@@ -162,6 +162,7 @@ def tabulate_bands(of_logs: Mapping[tuple[str, str], AccuracyTotal]) -> pd.DataF
 
 
 def _band_rows(name: str, dimension: str, edges: Sequence[float], sums: Any, log: str | None) -> list[dict[str, Any]]:
+    """Rows of `bands.csv`: sums by distance or time band as shares, RMSE and bias; empty bands are left out."""
     rows = []
     for k, band in enumerate(sums):
         if not (band["looked"] or band["pairs"] or band["ghosts"]):
@@ -270,7 +271,7 @@ def _split_by_runs(outcomes: Iterable[BlockOutcome], name: str) -> Iterator[tupl
 
 
 def _build_beside(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
-    """`PartTables.beside` of a configuration, in the order of the outcomes' rows."""
+    """`PartTables.beside`: accuracy by list and frame of each row of a configuration, in the order of the rows."""
     parts = []
     for outcome in outcomes:
         scores, assessed, runs = outcome.all_scores[name], outcome.assessed, len(outcome.runs)
@@ -317,7 +318,7 @@ def _count_steps(scores: ConfigurationScores, runs: int) -> tuple[Int, Float, Fl
 
 
 def _build_runs(outcomes: Sequence[BlockOutcome], name: str, needless: bool) -> pa.Table:
-    """`PartTables.runs` of a configuration, in the order of runs. `needless`: with the columns of needless braking."""
+    """`PartTables.runs`: lists, ghosts and instants of a configuration by run; `needless`: with those columns."""
     rows: list[dict[str, Any]] = []
     for outcome in outcomes:
         scores = outcome.all_scores[name]
@@ -368,7 +369,7 @@ def _driving_columns(needless: NeedlessBraking | None, s: int, levels: int) -> d
 
 
 def _tabulate_needless(outcomes: Sequence[BlockOutcome], name: str) -> pa.Table:
-    """`PartTables.needless` of a configuration, by run and begin."""
+    """`PartTables.needless`: a configuration's events of needless braking, by run and begin."""
     parts = [_EVENTS.empty_table()]
     for outcome in outcomes:
         if (braking := outcome.all_scores[name].needless) is None:  # the log has no ego

@@ -94,10 +94,7 @@ class WorldChunk:
         return draw_ghosts(self.scene, self.observations, self.experiment, self.log.placed, run, between_s)
 
     def listed(self, states: States) -> Tracks:
-        """All rows of all units' lists: rows of objects, ghosts, then rows of recorded units.
-
-        Ghosts are left out where states are the expected ones: ideal fusion alone has those.
-        """
+        """All rows of all units' lists: of objects, of ghosts (unless states are expected), of recorded units."""
         if states not in self._listed:
             scene, experiment, runs = self.scene, self.experiment, self.group.runs
             equipped = self.group.listing
@@ -145,7 +142,7 @@ class WorldChunk:
 
     @cached_property
     def claims(self) -> ClaimedRows:
-        """The claims of the units about their rows; equal in all runs where no claim is drawn."""
+        """Existence, class and id that units claim of their rows; the same in all runs where nothing is drawn."""
         observations, experiment, ghosts = self.observations, self.experiment, self.ghosts
         existence, class_ix = observations.existence, observations.view.class_ix
         claims = EntryClaims(existence, np.eye(len(CLASSES))[class_ix], np.full(len(existence), -1))
@@ -160,8 +157,8 @@ class WorldChunk:
             given = EntryClaims(recorded.existence, recorded.class_probability, recorded.track_id)
             claims = claims.followed_by(given)
         # A unit with track ids takes entries of one id for one object.
-        same = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), self.words)
-        return ClaimedRows(claims, same)
+        identity_words = np.where(claims.track_id >= 0, claims.track_id.astype(np.uint64), self.words)
+        return ClaimedRows(claims, identity_words)
 
 
 # Transmission: when what is sent reaches each receiver.

@@ -152,7 +152,7 @@ class _Scale:
         return f"{100 * value:.0f} %" if 0.005 <= value < 0.995 or value in (0, 1) else _format_edge(value)
 
     def tell_difference(self, pair: _JudgedPair) -> str:
-        """`by 0.12 s [0.05, 0.20]`; of one that is not shown, or has no interval, `0.12 s sooner [-0.01, 0.25]`."""
+        """`by 0.12 s [0.05, 0.20]`; if not shown or without interval `0.12 s sooner [-0.01, 0.25]`; “”: the same."""
         if pair.word in (_SAME, _NEAR):
             return ""
         claimed = pair.word in (BETTER, WORSE)
@@ -242,7 +242,7 @@ class _JudgedPair:
 
     @staticmethod
     def of(row: Any, scale: _Scale) -> _JudgedPair:
-        """The pair of a row of a comparison."""
+        """The pair of a comparison's row with its word: better, worse, open, the same, near, alike, “” (no limits)."""
         limits = (float(row.low), float(row.high))
         gains = [scale.gain(limit) for limit in limits]
         word = OPEN if min(gains) <= NOTHING and max(gains) >= -NOTHING else BETTER if min(gains) > 0 else WORSE
@@ -257,9 +257,8 @@ class _JudgedPair:
 
 
 def _tell_groups(baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale, brakers: Collection[str] = ()) -> str:
-    """Who is better than the baseline, who is worse, of whom no difference is shown, of whom nothing can be shown.
-
-    `brakers`, who brake for nothing, do not stand among the better ones.
+    """Who is better than the baseline, who is worse, of whom no difference is shown, and of whom none can be.
+    `brakers`, who brake for nothing, are named apart as “better, but braking for nothing”.
     """
     better, worse = ("Better", "Worse") if scale.is_share else ("Sooner", "Later")
     bases = [pair.base for pair in pairs.values()]
@@ -297,30 +296,30 @@ def _tell_too_few(pairs: Mapping[str, _JudgedPair]) -> str:
 
 
 def _list_pairs(pairs: Mapping[str, _JudgedPair], scale: _Scale) -> str:
-    """`A and B by 0.12 s [0.05, 0.2], C by …`, the best first; those of equal words together, of many the first."""
+    """`A and B by 0.12 s [0.05, 0.2], C by …`: best first, equal words joined, after `_NAMED` names “and 3 more”."""
     by_words: dict[str, list[str]] = {}
     for name, pair in sorted(pairs.items(), key=lambda item: -scale.gain(item[1].difference)):
         by_words.setdefault(scale.tell_difference(pair), []).append(name)
-    most = _NAMED if len(pairs) > _NAMED + 1 else len(pairs)  # one more takes no more room than to say so
-    shown, left, more = [], most, len(pairs) - most
+    named_count = _NAMED if len(pairs) > _NAMED + 1 else len(pairs)  # one more takes no more room than to say so
+    shown, names_left, unnamed_count = [], named_count, len(pairs) - named_count
     for words, names in by_words.items():
-        named = names[:left]
-        left -= len(named)
+        named = names[:names_left]
+        names_left -= len(named)
         if named:
-            several = len(named) > 1 and (words or more <= 0)  # else `and 3 more` ends the list
+            several = len(named) > 1 and (words or unnamed_count <= 0)  # else `and 3 more` ends the list
             listed = f"{', '.join(named[:-1])} and {named[-1]}" if several else ", ".join(named)
             shown.append(f"{listed} {words}".rstrip())
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+    return ", ".join(shown) + (f" and {unnamed_count} more" if unnamed_count > 0 else "")
 
 
 # In parts.
 
 
 def _tell_parts(results: Results, comparison: Comparison, names: Sequence[str]) -> Iterator[str]:
-    """What cooperation brings against the car alone, what fusion costs against the ideal of the same lists, what
-    latency costs against the same without it; then the rest against the car alone.
+    """What cooperation, fusion (against the ideal of the same lists) and latency bring, a sentence each; then the rest.
 
-    Without a car alone (`find_alone`), or where none of `names` has another unit, fusion and latency if that is all.
+    Nothing where no configuration is the car alone or no other unit takes part, unless fusion or latency is all there
+    is.
     """
     alone, experiment = find_alone(results, names) or "", results.experiment
     base = {*experiment.units_of(experiment.configurations[alone])} if alone else set()
@@ -331,27 +330,27 @@ def _tell_parts(results: Results, comparison: Comparison, names: Sequence[str]) 
     if not joint and (not ideals or {*names} - {*ideals, *ideals.values(), *_find_twins(experiment, names)}):
         return
     (scale, first), brakers = _judge_pairs(comparison), _tell_needless(comparison, None)[0]
-    known: dict[tuple[str, str], _JudgedPair | None] = {(of, comparison.baseline): pair for of, pair in first.items()}
-    hold = partial(_hold_against, results, scale=scale, known=known)
+    judged: dict[tuple[str, str], _JudgedPair | None] = {(of, comparison.baseline): pair for of, pair in first.items()}
+    judge = partial(_hold_against, results, scale=scale, known=judged)
     shown = [name for name in names if name in joint - {*ideals.values()}]
-    hold({name: alone for name in names if joint and name not in {alone, *ideals.values()}})  # all at once
-    pairs = hold(dict.fromkeys(shown, alone))
+    judge({name: alone for name in names if joint and name not in {alone, *ideals.values()}})  # all at once
+    pairs = judge(dict.fromkeys(shown, alone))
     latencies = _tell_latencies(alone, pairs, scale, experiment)
     if pairs:
         sentence = latencies or f"Cooperation: {_start_low(_tell_groups(alone, pairs, scale, brakers))}"
         yield f"{sentence}."
     elif shown:
         yield f"Cooperation: not known, for no log has both {alone} and {' or '.join(shown[:_NAMED])}."
-    if ideals and (fused := hold(ideals)):
+    if ideals and (fused := judge(ideals)):
         [*against] = {*ideals.values()}
         sentence = _tell_groups(against[0] if len(against) == 1 else _IDEAL, fused, scale, brakers)
         yield f"Fusion: {_start_low(sentence)}."
     twins = {} if latencies else _find_twins(experiment, names)
-    if late := hold({name: twin for name, (twin, _) in twins.items()}):
-        yield f"Latency: {_tell_costs(late, twins, scale)}."
+    if late_pairs := judge({name: twin for name, (twin, _) in twins.items()}):
+        yield f"Latency: {_tell_costs(late_pairs, twins, scale)}."
     remaining = [name for name in names if name not in {alone, *shown, *ideals, *ideals.values(), *twins}]
-    if joint and (beside := hold(dict.fromkeys(remaining, alone))):
-        yield f"Beside them: {_start_low(_tell_groups(alone, beside, scale, brakers))}."
+    if joint and (remaining_pairs := judge(dict.fromkeys(remaining, alone))):
+        yield f"Beside them: {_start_low(_tell_groups(alone, remaining_pairs, scale, brakers))}."
 
 
 def _start_low(sentence: str) -> str:
@@ -361,7 +360,7 @@ def _start_low(sentence: str) -> str:
 def _hold_against(
     results: Results, baseline_of: Mapping[str, str], scale: _Scale, known: dict[tuple[str, str], _JudgedPair | None]
 ) -> dict[str, _JudgedPair]:
-    """Configurations, each against another one, where both have rows. `known`: pairs compared before, and now."""
+    """Each configuration judged against its baseline, where both have rows. `known`: cache of pairs, filled here."""
     for baseline in dict.fromkeys(pair[1] for pair in baseline_of.items() if pair not in known):
         names = [name for name, other in baseline_of.items() if other == baseline and (name, other) not in known]
         compared = compare_folders(
@@ -384,67 +383,66 @@ def _find_twins(experiment: Experiment, names: Sequence[str]) -> dict[str, tuple
 
 
 def _group_by_latency(experiment: Experiment, names: Iterable[str]) -> list[dict[str, float]]:
-    """Latencies of configurations that differ in nothing else, group by group, the smallest first."""
+    """Groups of configurations that differ in latency only: name → latency (s), ascending."""
     groups: list[tuple[Configuration, dict[str, float]]] = []
     for name in names:
         configuration = experiment.configurations[name]
         if configuration.recorded is not None or isinstance(configuration.latency_s, dict):
             continue
-        plain = configuration.model_copy(update={"latency_s": 0.0})
-        latencies_s = next((of_alike for of, of_alike in groups if of == plain), None)
+        without_latency = configuration.model_copy(update={"latency_s": 0.0})
+        latencies_s = next((of_alike for of, of_alike in groups if of == without_latency), None)
         if latencies_s is None:
-            groups.append((plain, latencies_s := {}))
+            groups.append((without_latency, latencies_s := {}))
         latencies_s[name] = configuration.latency_s
     return [dict(sorted(latencies_s.items(), key=itemgetter(1))) for _, latencies_s in groups]
 
 
 def _tell_costs(pairs: Mapping[str, _JudgedPair], twins: Mapping[str, tuple[str, str]], scale: _Scale) -> str:
-    """`0.5 s costs 0.51 s [0.50, 0.52] (late against gnn)`, those of equal words together."""
+    """`0.5 s costs 0.51 s [0.50, 0.52] (late against gnn)`; `twins`: by name the same without latency, and it."""
     verbs = {_SAME: "changes nothing", _NEAR: f"changes less than {scale.least}", OPEN: "is not shown to matter:"}
-    tails, by_words = {_ALIKE: ", alike in every pair", "": " on these objects alone"}, dict[str, list[str]]()
+    endings, by_words = {_ALIKE: ", alike in every pair", "": " on these objects alone"}, dict[str, list[str]]()
     for name, pair in pairs.items():
         first, latency = twins[name]
         verb, size = verbs.get(pair.word), scale.tell_difference(pair)
         if verb is None:
             verb = "gains" if scale.gain(pair.difference) > 0 else "costs"
             size = re.sub("^by |^[+-]| later| sooner", "", size)
-        words = f"{latency} {verb} {size}".rstrip() + tails.get(pair.word, "")
+        words = f"{latency} {verb} {size}".rstrip() + endings.get(pair.word, "")
         by_words.setdefault(words, []).append(f"{name} against {first}")
-    told = [f"{words} ({', '.join(of[:_NAMED])}{' …' * (len(of) > _NAMED)})" for words, of in by_words.items()]
-    more = f"; and {len(told) - _NAMED} more" if len(told) > _NAMED else ""
-    return "; ".join(told[:_NAMED]) + more
+    sentences = [f"{words} ({', '.join(of[:_NAMED])}{' …' * (len(of) > _NAMED)})" for words, of in by_words.items()]
+    more = f"; and {len(sentences) - _NAMED} more" if len(sentences) > _NAMED else ""
+    return "; ".join(sentences[:_NAMED]) + more
 
 
 # Who brakes for nothing.
 
 
 def _tell_needless(comparison: Comparison, results: Results | None) -> tuple[set[str], str]:
-    """Who brakes for nothing for longer than the baseline, or if that does than another; and a sentence, “” of nobody.
-
-    Shown by the interval of the difference; where there is none, of these drives.
+    """Who brakes for nothing longer than the baseline (if that itself does: than the best), and a sentence; “”: nobody.
+    Shown by the interval of the difference; where there is none, by the difference.
     """
     rows = comparison.overall[comparison.overall["metric"] == SHARE]
     rows = rows[~rows["configuration"].isin(comparison.truths) & rows["difference"].notna()]
-    shown = rows["low"].isna() | (rows["low"] > NOTHING) | (rows["high"] < -NOTHING)
-    differing = rows[shown & (rows["difference"].abs() >= MATTERS[SHARE])]
+    is_shown = rows["low"].isna() | (rows["low"] > NOTHING) | (rows["high"] < -NOTHING)
+    differing = rows[is_shown & (rows["difference"].abs() >= MATTERS[SHARE])]
     shorter, reference = differing[differing["difference"] < 0], comparison.baseline
     brakers = dict(zip(rows["configuration"], rows["value"].astype(float), strict=True))
     if len(shorter):  # the baseline brakes, and with it whoever is not shown to brake less
         best = shorter.loc[shorter["value"].idxmin()]
-        reference, least = str(best["configuration"]), float(best["value"])
+        reference, least_share = str(best["configuration"]), float(best["value"])
         brakers[comparison.baseline] = float(shorter["baseline_value"].max())
         for name in shorter["configuration"]:
             del brakers[name]
-        brakers = {name: share for name, share in brakers.items() if share - least >= MATTERS[SHARE]}
+        brakers = {name: share for name, share in brakers.items() if share - least_share >= MATTERS[SHARE]}
     else:
-        least = float(rows["baseline_value"].min()) if len(rows) else 0.0
+        least_share = float(rows["baseline_value"].min()) if len(rows) else 0.0
         longer = set(differing["configuration"])
         brakers = {name: share for name, share in brakers.items() if name in longer}
     summary = None if results is None or SHARE not in results.summary else results.summary.set_index("configuration")
     names = sorted(brakers, key=lambda name: -brakers[name])
     if not names:
-        alike = [] if summary is None else [*summary.index[summary[SHARE] >= MATTERS[SHARE]]]
-        because = _explain_braking(results, alike)
+        braking_alike = [] if summary is None else [*summary.index[summary[SHARE] >= MATTERS[SHARE]]]
+        because = _explain_braking(results, braking_alike)
         return set(), f"The driver brakes for nothing{because}." if because else ""
     h = 0.0 if summary is None else float(summary["driving_h"].max())
     driving = "the driving time" if summary is None else f"these {3600 * h:.3g} s" if h < 0.25 else f"these {h:.3g} h"
@@ -452,7 +450,7 @@ def _tell_needless(comparison: Comparison, results: Results | None) -> tuple[set
     sentence = f"But with {names[0]} the driver brakes for nothing in {_format_share(brakers[names[0]])} of {driving}"
     sentence += "".join(f", with {name} in {_format_share(brakers[name])}" for name in names[1:_NAMED])
     sentence += f" and with {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    sentence += f" ({reference}: {'never' if least == 0 else _format_share(least)})"
+    sentence += f" ({reference}: {'never' if least_share == 0 else _format_share(least_share)})"
     if summary is not None:
         sentence += f", losing up to {summary.loc[names, 'needless_speed_lost_max_mps'].max():.3g} m/s at a time"
     return set(brakers), f"{sentence}{_explain_braking(results, names)}."
@@ -477,7 +475,7 @@ def _format_share(share: float) -> str:
 def _tell_latencies(
     baseline: str, pairs: Mapping[str, _JudgedPair], scale: _Scale, experiment: Experiment | None
 ) -> str | None:
-    """Up to which latency the others help, and from which on they are worse; None: they differ in more than that."""
+    """Up to which latency the others help, from which they are worse; None: latency is not the only difference."""
     groups = [] if experiment is None else _group_by_latency(experiment, pairs)
     if experiment is None or len(groups) != 1 or not len({*groups[0].values()}) == len(pairs) > 1:
         return None

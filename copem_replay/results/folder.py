@@ -168,7 +168,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 
 def _try_lock(path: Path, folder: Path) -> tuple[int, bool]:
-    """The lock file, open, and whether it is locked: False where there are no locks."""
+    """An open file descriptor of the lock, and whether it is locked (False: the file system has no locks)."""
     for _ in range(_TRIES):
         fd = _open_lock(path)
         locked = try_lock(fd)
@@ -231,7 +231,7 @@ class ResultsPlace:
 
     @contextmanager
     def may_fail(self, names: Sequence[str]) -> Iterator[None]:
-        """Write files without which the results are complete: an error goes to `failed`, and the files are left out."""
+        """Context in which optional files are written: on an error they are deleted and a line goes to `failed`."""
         try:
             yield
         except Exception as error:  # also a defect: it must not cost the results of hours
@@ -274,7 +274,7 @@ class ResultsPlace:
         flush_file(self.folder.parent)
 
     def _replace(self, files: Sequence[str], old_stat: os.stat_result) -> bool:
-        """Put the new folder in the place of the old one, with the user's own files. False: it cannot be."""
+        """Swap the new folder in for the old one, keeping the user's files. False: a user's file is in the way."""
         belongings = list_belongings(self.folder)
         if belongings is None or find_taken(belongings.list_others(self.folder, files), files):
             return False

@@ -123,6 +123,7 @@ def find_population(results: Results) -> str:
 
 
 def _make_verdict(name: str, criterion: Criterion, configuration: str, group: str, item: JudgedFigure) -> Verdict:
+    """The verdict on a criterion for one configuration and group, from the figure that was measured."""
     figure = item.figure
     word, why = _find_verdict(criterion, item)
     passes = word == MET or (word == UNDECIDED and criterion.passes_unless_refuted)
@@ -155,14 +156,14 @@ def _finite(value: float | None) -> float | None:
 
 
 def _find_verdict(criterion: Criterion, item: JudgedFigure) -> tuple[str, str]:
-    """The word, and why."""
+    """The verdict (met, not met, undecided, not measured) and a phrase on why."""
     figure, bound, direction = item.figure, criterion.bound, criterion.direction
     if figure.value is None:
         return NOT_MEASURED, item.why or "no row has a value"
     if figure.kind == ALL_ALIKE:
-        good = judge_limits(figure.value, figure.value, bound, direction) == MET
+        value_is_good = judge_limits(figure.value, figure.value, bound, direction) == MET
         why = "the same throughout, so how it varies is not known"
-        return (UNDECIDED if good else NOT_MET), why
+        return (UNDECIDED if value_is_good else NOT_MET), why
     if figure.kind is None or math.isnan(figure.low) or math.isnan(figure.high):
         return NOT_MEASURED, item.why or "no interval"
     word = judge_limits(figure.low, figure.high, bound, direction)
@@ -235,7 +236,7 @@ class _JudgedStudy:
 
     @cached_property
     def runs(self) -> StudyRows:
-        """The rows run by run, those of the tally with a column `run`."""
+        """The study with one row by episode and run (column `run`), for criteria on single runs; read from all logs."""
         tables, sums = [], []
         metrics = self.traffic.settings.own
         for log in self.results.rows.logs:
@@ -267,6 +268,7 @@ class _JudgedStudy:
         return self._groups[narrowed]
 
     def _make_groups(self, name: str, criterion: Criterion) -> list[_JudgedGroup]:
+        """The groups of episodes that a criterion is judged on: all as one, one by its `by`, or each of a slice."""
         study = self.runs if criterion.of_runs else self.traffic
         episodes = study.episodes
         is_chosen, logs = self._choose_episodes(name, criterion, episodes)
@@ -284,7 +286,7 @@ class _JudgedStudy:
         return [_JudgedGroup(one.label, one.rows, _list_episodes(one.rows, whole=is_whole), every) for one in groups]
 
     def _choose_episodes(self, name: str, criterion: Criterion, episodes: pd.DataFrame) -> tuple[Bool, set[str]]:
-        """(E,) which episodes a criterion is about, and the logs. Raises InputError where no log has such a name."""
+        """(E,) whether each episode is meant by a criterion, and the log names. Raises InputError: no such log."""
         logs = [log.name for log in self.results.provenance.logs]
         patterns = criterion.logs or ("*",)
         for k, pattern in enumerate(patterns):
@@ -307,21 +309,21 @@ class _JudgedStudy:
         rows: StudyRows,
         groups: Sequence[Group],
     ) -> Group:
-        """The group that `cut` names, without rows where the chosen rows have none of it."""
+        """The group with the values of `where`; an empty one, if the chosen rows have none. InputError: unknown."""
         values = tuple(map(str, where.values()))
         if found := [one for one in groups if one.values == values]:
             return found[0]
         for k, (key, value) in enumerate(where.items()):
-            known = sorted({one.values[k] for one in study.split(cut)})
-            if value not in known and not key.startswith(("class", "began")):
-                raise InputError(f"criteria.{name}.by.{key}: {unknown_name_message('group', value, known)}")
+            known_values = sorted({one.values[k] for one in study.split(cut)})
+            if value not in known_values and not key.startswith(("class", "began")):
+                raise InputError(f"criteria.{name}.by.{key}: {unknown_name_message('group', value, known_values)}")
         nothing = rows.select(np.zeros(len(rows.episodes), dtype=bool))
         return Group(cut, values, nothing)
 
     # Figures.
 
     def measure(self, name: str, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
-        """The figure of a configuration with its limits."""
+        """The figure that a criterion judges, with its limits: of rows, lists, driving or sums, or a difference."""
         if criterion.against is not None:
             return self._measure_difference(name, criterion, configuration, group)
         metric = criterion.metric
@@ -334,6 +336,7 @@ class _JudgedStudy:
         return self._measure_sums(criterion, configuration, group)
 
     def _measure_rows(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
+        """The figure of a metric of detection rows, with its limits; computed rows are cached in `group.made`."""
         judged, settings = JUDGED[criterion.metric], group.rows.settings
         kind = judged.rows
         weigh = criterion.weigh or settings.weigh
@@ -378,7 +381,7 @@ class _JudgedStudy:
         return FigureRows(table, weight, clusters, least_share, facts.least_s), basis
 
     def _split_table(self, group: _JudgedGroup, kind: str) -> dict[str, pd.DataFrame]:
-        """By configuration the rows of a group that count."""
+        """By configuration the rows that count; `kind`: `braking`, `detected`, `conflict` or `exact`."""
         study = group.rows
         name = "detected" if kind == "braking" else kind
         if name not in group.made:
@@ -395,7 +398,7 @@ class _JudgedStudy:
         return split
 
     def _measure_sums(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
-        """A metric of accuracy, or an own one, from sums by episode."""
+        """The figure of an accuracy metric, or a user's own, from sums by episode; or why there is none."""
         metric, sums = criterion.metric, group.rows.sums
         metrics = {one.name: one for one in group.rows.settings.own}
         names = [name for name in sums if name.startswith(f"{metric} ")]
@@ -414,13 +417,14 @@ class _JudgedStudy:
             return math.nan if value is None else float(value)
 
         compute = of_own if ratio is None else ratio.value_of
-        least = -math.inf if ratio is None else ratio.least
-        return self._limit_sums(criterion, configuration, sums, columns, compute, denominator, least)
+        least_value = -math.inf if ratio is None else ratio.least
+        return self._limit_sums(criterion, configuration, sums, columns, compute, denominator, least_value)
 
     def _limit_sums(
         self, criterion: Criterion, configuration: str, rows: pd.DataFrame, columns: Sequence[str], compute: Any,
         denominator: str, least: float = 0.0,
     ) -> JudgedFigure:  # fmt: skip
+        """The figure `compute` makes of summed `columns`, with limits over clusters; `denominator`: weighs rows."""
         clusters, why = None, ""
         fixed = criterion.of_runs and self.traffic.settings.facts[configuration].fixed
         if not fixed:
@@ -446,7 +450,7 @@ class _JudgedStudy:
         return self._limit_sums(criterion, configuration, lists, columns, lambda of: of[..., 0] / of[..., 1], "minutes")
 
     def _measure_driving(self, criterion: Criterion, configuration: str, group: _JudgedGroup) -> JudgedFigure:
-        """Needless braking, which belongs to whole logs."""
+        """The figure of needless braking; without a value for parts of a log, or where the ego does not drive."""
         lists = group.rows.lists
         if lists is None:
             why = "accuracy is not measured" if self.traffic.lists is None else "needless braking is of whole logs"
@@ -466,9 +470,9 @@ class _JudgedStudy:
     def _measure_difference(
         self, name: str, criterion: Criterion, configuration: str, group: _JudgedGroup
     ) -> JudgedFigure:
-        """The difference to another configuration, of these results or of those before, pair by pair."""
-        known = list(self.results.experiment.configurations)
-        other, of_before = criterion.find_against(configuration, known)
+        """The figure of a difference, pair by pair, from another configuration here or in the --before folder."""
+        configurations = list(self.results.experiment.configurations)
+        other, of_before = criterion.find_against(configuration, configurations)
         if of_before and self.before is None:
             raise InputError(f"criteria.{name}.against: {criterion.against}: give the folder with --before")
         if of_before and self.before is not None and other not in self.before.facts:
@@ -483,9 +487,8 @@ class _JudgedStudy:
         return _difference_of(rows.iloc[0], criterion)
 
     def _compare(self, criterion: Criterion, other: str, group: _JudgedGroup, *, of_before: bool) -> pd.DataFrame:
-        """The overall rows of a comparison with a configuration, in all metrics that are asked of this group.
-
-        The column `configuration` has names, not labels.
+        """The overall rows against configuration `other`, in all metrics that such criteria ask of this group. The
+        column `configuration` has names, not labels.
         """
         criteria = [
             one for one in self.criteria.values()
@@ -511,7 +514,7 @@ class _JudgedStudy:
 
 
 def _difference_of(row: pd.Series, criterion: Criterion) -> JudgedFigure:
-    """The difference of a row of a comparison; on the side on which it is met its limits are those between bounds."""
+    """The figure of one comparison row; where the bound can be met by limits from bounded values, with those limits."""
     n, of_runs = int(row["n"]), criterion.of_runs
     if pd.isna(row["difference"]):
         return replace(_NO_ROW, n=n, why="no pair has it")

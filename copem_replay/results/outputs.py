@@ -113,7 +113,7 @@ def _is_table(name: str) -> bool:
 
 
 def _describe_content(path: Path) -> str | None:
-    """What an existing file is that no output replaces; None: it may be replaced. Raises OutputError."""
+    """What an existing file is that no output may replace, such as `a recording`; None: it may. Raises OutputError."""
     from copem_replay.io.containers.mcap_records import MAGIC
     from copem_replay.io.log import ROS1, SQLITE
 

@@ -139,7 +139,7 @@ class Results:
 
     @cached_property
     def source(self) -> ExperimentSource:
-        """The experiment as plain data."""
+        """The experiment of the results as plain data, checked against damage (InputError)."""
         self._check_sealed(EXPERIMENT)
         file = self._files_at / EXPERIMENT
         try:
@@ -326,7 +326,7 @@ class Results:
 
     @cached_property
     def by_log(self) -> Mapping[str, LogRows]:
-        """By file name the tables that comparisons read, those that exist."""
+        """By file name, the folder's tables that comparisons read. Raises InputError: no rows, or unknown names."""
         rows = self.rows
         if not rows.counts:
             raise InputError(f"{self.place}: nothing can be compared: no measured object has an onset")
@@ -357,10 +357,9 @@ class Results:
         return settings_places(self.experiment.logs, number, base)[0]
 
     def recording(self, log: str, experiment: Experiment) -> Recording:
-        """The recording of a log, read again as an experiment, this one or one made of it, has it.
+        """The recording of a log, read again for `experiment` (this one, or one made of it); the last one is cached.
 
-        The one that was read last is kept, for the next that shows it. Raises RecordingError, one line, where the
-        recording is missing or not the one that was replayed; InputError where rows name objects that it does not have.
+        Raises RecordingError where it is missing or not the replayed one, InputError where rows name unknown objects.
         """
         if self.study is not None:
             return self.study.find_log(log).whole()

@@ -58,12 +58,12 @@ def _value_of(experiment: Experiment, key: str, name: str) -> Any:
 
 
 def _describe_change(experiment: Experiment, keys: Sequence[str], last: str, best: str) -> str:
-    """What is better in the other one: “without the 1.5 s of latency”; “” where much is different."""
+    """What `best` changes of `last` in `keys`: “without the 1.5 s of latency”; “” where much is different."""
     values = {key: (_value_of(experiment, key, last), _value_of(experiment, key, best)) for key in keys}
     old_units, new_units = values.pop("units", (frozenset(), frozenset()))
-    rest = f" (and another {' and '.join(_KEYS[key] for key in values)})" if values else ""
+    other_changes = f" (and another {' and '.join(_KEYS[key] for key in values)})" if values else ""
     if new_units > old_units:
-        return f"the lists of {_name_units(new_units - old_units)} as well{rest}"
+        return f"the lists of {_name_units(new_units - old_units)} as well{other_changes}"
     if len(keys) != 1:
         return ""
     if not values:

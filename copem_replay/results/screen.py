@@ -131,7 +131,7 @@ def tabulate_alike(
 
 
 def _describe_rows(results: Results) -> Iterator[str]:
-    """What counts, over what, and what makes it worthless."""
+    """Lines on how many objects, runs and logs count, and warnings where they are too few for an interval."""
     logs, objects, passes = count_clusters(results.known)
     runs, names = results.provenance.runs, [log.name for log in results.provenance.logs]
     where = names[0] if len(names) == 1 else count_noun(len(names), "log")
@@ -156,7 +156,7 @@ def describe_counted(objects: int, passes: int) -> str:
 
 
 def _describe_left_out(results: Results) -> str:
-    """Who does not count: `; not 9 more there at the start`."""
+    """`; not 9 more there at the start`: how many objects do not count, by how their episode began; “”: all count."""
     rows = results.tally.drop_duplicates(["log", "object_id", "episode"])
     rows = rows[has_frame_after(rows)]
     words = set(results.provenance.measure["began"])
@@ -241,7 +241,7 @@ def _pack_columns(names: Sequence[str], cells: Mapping[str, Sequence[str]]) -> l
 
 
 def _describe_pairs(comparison: Comparison, metrics: Sequence[str], starred: bool) -> Iterator[str]:
-    """What it is held against, and what the intervals are over."""
+    """Lines on the baseline, on what the intervals are over (logs, objects or runs), and on what the star means."""
     limited, over = comparison.overall.dropna(subset=["interval_over", "clusters"]), dict[str, list[str]]()
     for metric in metrics:
         for kind, of in limited[limited["metric"] == metric].groupby("interval_over"):

@@ -134,9 +134,8 @@ def pick_evenly(
 
 
 def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episodes: pd.DataFrame) -> Float:
-    """(M,) least distance (m) of each object from the ego's path of the next `PATH_S`, from onset to last detection.
-
-    0 without an ego; inf where the ego is not there.
+    """(M,) least distance (m) of each object to the ego's path of the next `PATH_S`, from onset to last detection. 0
+    without an ego; inf where the ego is not there.
     """
     ego_ix = find_followed(scene, experiment)
     if ego_ix < 0:
@@ -144,16 +143,16 @@ def _distance_to_path(scene: Scene, truth: Tracks, experiment: Experiment, episo
     first_s, last_s = (episodes[name].to_numpy(dtype=float) for name in ("onset_s", "last_s"))
     steps = np.maximum(np.ceil((last_s - first_s) / _STEP_S), 0).astype(np.int64) + 1
     episode_ix = np.repeat(np.arange(len(steps)), steps)
-    within = np.arange(len(episode_ix)) - np.repeat(np.cumsum(steps) - steps, steps)
-    time_s = np.minimum(first_s[episode_ix] + _STEP_S * within, np.maximum(last_s, first_s)[episode_ix])
+    step_ix = np.arange(len(episode_ix)) - np.repeat(np.cumsum(steps) - steps, steps)
+    time_s = np.minimum(first_s[episode_ix] + _STEP_S * step_ix, np.maximum(last_s, first_s)[episode_ix])
     numbers = episodes.index.map(scene.object_number).to_numpy(dtype=np.int64)
     place = interpolate_places(scene, truth, experiment, numbers[episode_ix], time_s)
-    nearest = np.full(len(steps), np.inf)
+    least_m = np.full(len(steps), np.inf)
     for ahead_s in np.arange(0.0, PATH_S + _STEP_S / 2, _STEP_S):
         ego_place = interpolate_places(scene, truth, experiment, np.full(len(episode_ix), ego_ix), time_s + ahead_s)
         distance = np.hypot(*(place - ego_place)[:2])
-        np.minimum.at(nearest, episode_ix, np.where(np.isnan(distance), np.inf, distance))
-    return nearest
+        np.minimum.at(least_m, episode_ix, np.where(np.isnan(distance), np.inf, distance))
+    return least_m
 
 
 def find_followed(scene: Scene, experiment: Experiment) -> int:

@@ -129,6 +129,7 @@ def check_values(path: Path, column: Column, values: Any, *, optional: bool = Fa
 
 
 def _is_kind(kind: str, data_type: pa.DataType) -> bool:
+    """Whether a column of this Arrow type can hold a kind of values, such as `numbers or null`."""
     types = pa.types
     if kind.startswith("lists of "):
         listed = types.is_list(data_type) or types.is_large_list(data_type)
@@ -162,7 +163,7 @@ class LogRows:
     read: Callable[[str, Sequence[str]], list[pa.Table]]
 
     def of(self, log: str) -> pa.Table:
-        """A log's rows without the column `log`, text as `string`. Raises InputError where they are damaged."""
+        """A log's rows (columns of `kinds` but `log`, text as `string`). Raises InputError where values are damaged."""
         names = [name for name in self.kinds if name != "log"]
         parts = self.read(log, names)
         table = pa.concat_tables(parts) if parts else self.without_rows.select(names)
@@ -319,7 +320,7 @@ class TableFile:
             self._writer.close()
 
     def add(self, table: Any) -> None:
-        """Add rows."""
+        """Add a pandas or Arrow table; rows are written in full row groups, the remainder is held until more come."""
         arrow = pa.Table.from_pandas(table, preserve_index=False) if isinstance(table, pd.DataFrame) else table
         arrow = arrow.cast(pa.schema([_write_field(field) for field in arrow.schema], arrow.schema.metadata))
         if self._writer is None:

@@ -76,7 +76,7 @@ MOST_ROWS = 200_000
 
 
 def _draw_moving(replayed: ReplayedRun, named: Collection[int]) -> Iterator[MovingEntities]:
-    """Bodies and the marks of carried units, frame by frame: bodies first, then units in the experiment's order."""
+    """Bodies and carried units in chunks of frames: first bodies, then units in the experiment's order."""
     scene, truth = replayed.replay.scene, replayed.replay.truth
     order, bounds = truth.by_frame
     carried = [*_draw_carried_units(replayed)]
@@ -109,15 +109,15 @@ class _Moving(NamedTuple):
 
 
 def _draw_bodies(scene: Scene, truth: Tracks, rows: Int, named: Collection[int]) -> _Moving:
-    """The valid ones of some rows of the truth; an object has a look of its own as long as its size stays."""
+    """Bodies of valid truth `rows`: distinct looks (object and size) and each row's look and pose (x, y, z, yaw)."""
     rows = rows[truth.valid[0, rows]]
     numbers = np.stack([truth.row_object_ix[rows], *(getattr(truth, f"{n}_m")[0, rows] for n in _SIZES)])
     by_object = np.argsort(numbers[0], kind="stable")
     ordered = numbers[:, by_object]
-    first = np.concatenate([[True], (ordered[:, 1:] != ordered[:, :-1]).any(axis=0)])[: len(rows)]
+    is_new = np.concatenate([[True], (ordered[:, 1:] != ordered[:, :-1]).any(axis=0)])[: len(rows)]
     look = np.empty(len(rows), dtype=np.int64)
-    look[by_object] = np.cumsum(first) - 1
-    looks = [_draw_body(scene, int(k), size, named=int(k) in named) for k, *size in ordered[:, first].T.tolist()]
+    look[by_object] = np.cumsum(is_new) - 1
+    looks = [_draw_body(scene, int(k), size, named=int(k) in named) for k, *size in ordered[:, is_new].T.tolist()]
     poses = np.stack([getattr(truth, name)[0, rows] for name in ("x_m", "y_m", "z_m", "yaw_rad")])
     return _Moving(looks, truth.frame_ix[rows], look, poses)
 
@@ -167,7 +167,7 @@ def _draw_lanes(replayed: ReplayedRun) -> Iterator[Entity]:
 
 
 def _draw_obstacles(replayed: ReplayedRun) -> Iterator[Entity]:
-    """Outlines of the convex parts of obstacles, at the bottom and at the top; those of maps as one entity."""
+    """Outlines of obstacles' convex parts at bottom and top, an entity each; all solids of maps are one entity."""
     static, solids = replayed.replay.placed.static, replayed.replay.placed.solids
     of_maps: list[Line] = []
     for part in range(len(static.body)):

@@ -298,11 +298,11 @@ _KINDS: dict[str, tuple[type, ...]] = {
 
 
 def _parse_verdict(number: int, row: Any) -> Verdict:
-    """A verdict of a line, whose word is that of its limits. Raises ValueError, KeyError, TypeError."""
+    """The verdict of one JSON line, checked against its own limits. Raises ValueError, KeyError, TypeError."""
     for column in fields(Verdict):
         value, kinds = row[column.name], [kind.strip() for kind in str(column.type).split("|")]
-        allowed = [one for kind in kinds for one in _KINDS.get(kind, ())]
-        if not (value is None and "None" in kinds) and type(value) not in allowed:
+        allowed_types = [one for kind in kinds for one in _KINDS.get(kind, ())]
+        if not (value is None and "None" in kinds) and type(value) not in allowed_types:
             raise ValueError(f"line {number}: {column.name}: expected {' or '.join(kinds)}, found {value!r}")
     verdict = Verdict(**row)
     expected = {verdict.verdict} & {*WORDS}

@@ -110,6 +110,7 @@ class Exporter:
 
 
 def _write_mcap(path: Path, run: RunToExport) -> list[str]:
+    """Write the replay of one run as MCAP, with the recording's own messages. Returns notes for the user."""
     from copem_replay.io.write.mcap import write_mcap
     from copem_replay.io.write.message_family import find_family
 
@@ -233,7 +234,7 @@ def _list_row_files(study: StudyTables) -> list[str]:
 
 
 def _write_files(scratch: Path, folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]] = ()) -> None:
-    """Write the experiment and all tables, with paths as they are from a folder."""
+    """Write the experiment and all tables to `scratch`; paths in them are relative to `folder`, where they will be."""
     data = relocate_experiment(resolve_sweep(study.experiment), study.recordings, folder)
     (scratch / EXPERIMENT).write_text(dump_yaml(data), encoding="utf-8")
     _write_rows(study, scratch)
@@ -265,7 +266,7 @@ def _write_provenance(folder: Path, content: Mapping[str, object], files: Iterab
 
 
 def _export(place: ResultsPlace, study: StudyTables, exporters: Sequence[Exporter]) -> list[str]:
-    """Write the shown runs. Returns notes for the user; files that cannot be written go to the place's `failed`."""
+    """Write the files of the shown runs. Returns notes for the user; of a failed file a line is in `place.failed`."""
     notes: list[str] = []
     for log in choose_logs(study.experiment, [one.name for one in study.logs]) if exporters else ():
         for shown in select_shown_runs(study, log):
@@ -292,13 +293,13 @@ def _find_recorded_latencies(data: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _logs_table(folder: Path, study: StudyTables, skipped: Sequence[tuple[File, str]]) -> pd.DataFrame:
-    """The rows of `logs.csv`: the replayed logs and the skipped recordings."""
+    """The table `logs.csv`: a row by replayed log (`done`) and by skipped recording, with the reason."""
     rows: list[dict[str, Any]] = []
     for log, facts in zip(study.logs, study.facts, strict=True):
         path = " + ".join(recording_name(replayed, folder) for replayed in list_recordings(log.recording.place))
         counts = {"episodes": facts.episodes, "rows": study.counts[log.name]}
-        done = {"log": log.name, "path": escape_name(path), "sha256": log.digests["sha256"], "state": "done"}
-        rows.append(done | counts)
+        log_row = {"log": log.name, "path": escape_name(path), "sha256": log.digests["sha256"], "state": "done"}
+        rows.append(log_row | counts)
     for place, why in skipped:
         left_out = {"path": escape_name(recording_name(place, folder)), "reason": escape_name(why)}
         rows.append({"log": None, "state": "skipped"} | left_out)
@@ -318,7 +319,7 @@ def _read_table(study: StudyTables) -> pd.DataFrame:
 
 
 def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToExport:
-    """One run of one log, in the configurations that the experiment shows."""
+    """What exporters need of one run of a log: recording, replayed run, rows, summary and manifest, shown ones only."""
     study_log = study.find_log(log)
     replay, recording = study_log.replay(), study_log.whole()
     experiment = resolve_for_log(study.experiment, log)
@@ -345,7 +346,7 @@ def _make_run_to_export(log: str, shown: ShownRun, study: StudyTables) -> RunToE
 
 
 def _write_rows(study: StudyTables, scratch: Path) -> None:
-    """Write the tables of rows, part by part as they are in memory, and the tally."""
+    """Write detections, accuracy and tally in batches; a file by log if there are more than `MANY_ROWS` rows."""
     with ExitStack() as open_files:
         files: dict[str | Path, TableFile] = {}
 
@@ -357,8 +358,8 @@ def _write_rows(study: StudyTables, scratch: Path) -> None:
 
         many = sum(study.counts.values()) > MANY_ROWS
         for rows, parts in study.batches():
-            for log, of_log in rows.groupby("log", sort=False) if many else [("", rows)]:
-                add("detections.parquet" if not many else table_file(Path("detections.parquet"), str(log)), of_log)
+            for log, log_rows in rows.groupby("log", sort=False) if many else [("", rows)]:
+                add("detections.parquet" if not many else table_file(Path("detections.parquet"), str(log)), log_rows)
             if study.bands is not None:
                 for name, table in study.accuracy_of(parts, rows).items():
                     add(name, table)

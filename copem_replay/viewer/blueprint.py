@@ -115,9 +115,8 @@ class RecordingContent:
         return lanes_axis_s(self.axes_s[object_ix], onset_s, self.configurations, object_ix in self.brief)
 
     def title(self, configuration: str, mark: str = " · ") -> str:
-        """“bursty · whole run: 18 of 24 known, 3 false, brakes 1× for nothing”; `mark`: after the name.
-
-        Of the objects that count, in all their passes, and of false tracks, where they are known: what tables count.
+        """“bursty · whole run: 18 of 24 known, 3 false, brakes 1× for nothing”; `mark`: what follows the name. Counts
+        objects that count, in all their passes, false tracks and needless braking, each where it is known.
         """
         counted, false, needless = (
             None if of is None else of[of["configuration"] == configuration]
@@ -314,9 +313,8 @@ def reasons_page(content: RecordingContent) -> rrb.Container:
 
 
 def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str, str]]:
-    """Names and titles of the configurations with units that knew an object last (or never) and first.
-
-    For a single shown object also the one in the middle.
+    """Names and titles of the configurations with units that knew an object last (or never) and first; for a single
+    shown object also of the middle one.
     """
     episodes = content.episodes[object_ix]
     episodes = episodes[episodes["configuration"].isin(select_perceiving(content.experiment, content.configurations))]
@@ -324,8 +322,8 @@ def _last_and_first(content: RecordingContent, object_ix: int) -> list[tuple[str
     if not when_s:
         return []
     ranked = sorted(when_s, key=lambda name: when_s[name], reverse=True)
-    between = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
-    names = dict.fromkeys([ranked[0], *between, ranked[-1]])
+    middle_name = [ranked[len(ranked) // 2]] if len(content.objects) == 1 else []
+    names = dict.fromkeys([ranked[0], *middle_name, ranked[-1]])
     titles = {
         name: f"{name}: known after {show_seconds(s)} s" if np.isfinite(s) else f"{name}: never known"
         for name, s in when_s.items()
@@ -497,7 +495,7 @@ def difference_view(path: Sequence[str]) -> rrb.TextDocumentView:
 def _curves_view(
     origin: str, title: str, axis: rrb.TimeAxis, *, legend: bool = False, values: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
-    """A view of curves over time, on the dark ground."""
+    """A view of curves over time on a dark ground; `values`: range of the vertical axis, None: as the curves are."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(

@@ -209,6 +209,7 @@ class EntriesBeside:
                 self._write(kind, tracks, rows_of, outlines)
 
     def _write(self, kind: str, tracks: Tracks, drawn: Bool, outlines: Callable[[Tracks, Int], np.ndarray]) -> None:
+        """Write outlines of `drawn` entries of one kind (as `false`, which have words), and once how they look."""
         import rerun as rr
 
         path, lines = ["world", configuration_part(self._name), kind], _LINES if kind == "false" else 1
@@ -269,9 +270,8 @@ def _pack_rgba(colour: tuple[int, int, int, int]) -> int:
 def _write_boxes(
     out: RecordingSink, path: list[str], tracks: Tracks, look: Callable[[Int], dict[str, Any]], mask: Bool | None = None
 ) -> None:
-    """Write the boxes of `tracks`, each list from the instant it is available.
-
-    `look`: further columns of rows. `mask` (P,): which are drawn, None: all.
+    """Write the boxes of `tracks`, each list from the instant it is available. `look(rows)`: further columns of rows,
+    such as colours; `mask` (P,): which are drawn, None: all valid ones.
     """
     import rerun as rr
 
@@ -292,20 +292,20 @@ def _round_to_steps(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _write_covariance(out: RecordingSink, path: list[str], tracks: Tracks, colour: Rgb) -> None:
-    """Write 2σ ellipses of the positions, flat under the boxes; none for exact positions."""
+    """Write 2σ ellipses of the positions, flat under the boxes; none for exact positions or without covariance."""
     import rerun as rr
 
     if tracks.cov_ee_m2 is None or tracks.cov_en_m2 is None or tracks.cov_nn_m2 is None:
         return
     ee, en, nn = tracks.cov_ee_m2[0], tracks.cov_en_m2[0], tracks.cov_nn_m2[0]
-    spread = tracks.valid[0] & ((ee + nn) / 2 + np.hypot((ee - nn) / 2, en) > SMALLEST_VARIANCE_M2)
-    if not spread.any():
+    is_spread = tracks.valid[0] & ((ee + nn) / 2 + np.hypot((ee - nn) / 2, en) > SMALLEST_VARIANCE_M2)
+    if not is_spread.any():
         return
     place = tracks.x_m, tracks.y_m, tracks.z_m - tracks.height_m / 2
-    for rows, counts, available_ns in slice_by_frame(tracks, spread):
+    for rows, counts, available_ns in slice_by_frame(tracks, is_spread):
         a, b, d = ee[rows], en[rows], nn[rows]
-        turn = np.hypot((a - d) / 2, b)
-        high, low = (a + d) / 2 + turn, np.maximum((a + d) / 2 - turn, SMALLEST_VARIANCE_M2)
+        half_spread = np.hypot((a - d) / 2, b)
+        high, low = (a + d) / 2 + half_spread, np.maximum((a + d) / 2 - half_spread, SMALLEST_VARIANCE_M2)
         columns = rr.Ellipsoids3D.columns(
             centers=_round_to_steps(stack_float32(*(column[0, rows] for column in place)), STEP_M),
             half_sizes=stack_float32(

@@ -204,17 +204,17 @@ def _hold_ends(place: Float) -> Float:
 
 
 def _fit_picture(eye: Camera, places: Sequence[Float]) -> tuple[Float, Float]:
-    """The middle (3, K) of a picture that holds places (3, K) each, and its scale (K,); NaN: nothing is held."""
+    """The middle (3, K) of a picture that holds places (3, K) each, and its scale (K,); NaN: there is no place."""
     away_m, all_places = float(np.linalg.norm(eye.place_m)), np.stack(places, axis=1)
     towards = -eye.place_m / away_m
     _, right, up = _axes(towards)
-    over = np.array([up[0], up[1], 0.0]) / np.hypot(up[0], up[1])
+    ground_up = np.array([up[0], up[1], 0.0]) / np.hypot(up[0], up[1])
     middle = np.zeros((3, all_places.shape[2]))
-    for way in (right, over):
+    for way in (right, ground_up):
         along = np.tensordot(way, all_places, 1)
         middle += way[:, None] * (np.nanmin(along, axis=0) + np.nanmax(along, axis=0)) / 2
-    off = ((all_places - middle[:, None]) / INSIDE).reshape(3, -1)
-    needed_m = np.nanmax(_fitting_distances(off, towards, eye.aspect).reshape(all_places.shape[1:]), axis=0)
+    offsets = ((all_places - middle[:, None]) / INSIDE).reshape(3, -1)
+    needed_m = np.nanmax(_fitting_distances(offsets, towards, eye.aspect).reshape(all_places.shape[1:]), axis=0)
     return middle, np.maximum(needed_m / away_m, 1.0)
 
 
@@ -243,7 +243,7 @@ def _own_states(replay: Replay, object_ix: int) -> tuple[Float, Float]:
 
 
 def _smooth(time_s: Float, values: Float) -> Float:
-    """The mean of values (K,) over `SMOOTH_S` around each instant; beyond the ends they stay as they are."""
+    """(K,) the mean of `values (K,)` over `SMOOTH_S` around each instant; beyond the ends they stay as they are."""
     if len(time_s) < 2:
         return values
     area = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(time_s))])
@@ -257,9 +257,8 @@ def _smooth(time_s: Float, values: Float) -> Float:
 
 
 def _write_arrows(out: RecordingSink, replay: Replay, picture: MovingPicture) -> None:
-    """Write a point with an arrow near the edge of the picture, on the ground, for each object outside it.
-
-    Objects farther from the ego than `WIDEST_M` have none: their names would cover those of nearer ones.
+    """Write for each object outside the picture a name with an arrow at its edge, on the ground; farther than
+    `WIDEST_M` from the ego none, as these would cover nearer ones.
     """
     place = np.stack([*picture.seen.values()], axis=1)  # (3, M, K)
     distance_m = np.hypot(place[0], place[1])
@@ -267,27 +266,26 @@ def _write_arrows(out: RecordingSink, replay: Replay, picture: MovingPicture) ->
     far_out = np.abs(_project(place / picture.scale, picture.eye)).max(axis=0)
     _, step = np.unique(picture.elapsed_ns // ARROW_NS, return_index=True)
     row, m = np.nonzero((far_out[:, step].T > 1.0) & (distance_m[:, step].T <= WIDEST_M))
-    at = m, step[row]
-    spots, sides = _move_to_edge(place[:, *at] / picture.scale[step[row]], picture.eye, row)
+    picked = m, step[row]
+    spots, sides = _move_to_edge(place[:, *picked] / picture.scale[step[row]], picture.eye, row)
     ids = np.array(short_ids(replay.scene), dtype=object)[np.array([*picture.seen])[m]]
-    labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[at], strict=True)]
+    labels = [f"{name} {side} {far:.0f} m" for name, side, far in zip(ids, sides, distance_m[picked], strict=True)]
     counts = np.bincount(row, minlength=len(step))
     _write_words(out, [*picture.eye.path, "arrows"], picture.elapsed_ns[step], spots, labels, counts, 1.5)
 
 
 def _move_to_edge(place: Float, eye: Camera, row: Int) -> tuple[Float, Sequence[str]]:
-    """Places (3, R) in the frame of a camera, outside its picture, moved to its edge, on the ground; arrows (R,).
-
-    `row` (R,): ascending numbers of instants; words of one instant are apart.
+    """Places (3, R) outside a camera's picture moved to its edge, on the ground; arrows (R,) that say which edge. `row`
+    (R,): ascending numbers of instants; words of one instant are kept apart.
     """
-    across, high = _project(place, eye)
-    far_out = np.maximum(np.abs(across), np.abs(high))
-    u, v = EDGE * across / far_out, EDGE * high / far_out
+    across, upward = _project(place, eye)
+    far_out = np.maximum(np.abs(across), np.abs(upward))
+    u, v = EDGE * across / far_out, EDGE * upward / far_out
     sides = np.where(np.abs(u) >= np.abs(v), np.where(u > 0, "→", "←"), np.where(v > 0, "↑", "↓"))
     _spread_words(u, v, row)
     towards, right, up = _axes(_look(np.pi / 2))
-    tall = np.tan(EYE_RAD / 2)
-    ray = towards[:, None] + u * eye.aspect * tall * right[:, None] + v * tall * up[:, None]
+    half_height = np.tan(EYE_RAD / 2)
+    ray = towards[:, None] + u * eye.aspect * half_height * right[:, None] + v * half_height * up[:, None]
     return eye.place_m[:, None] - eye.place_m[2] / ray[2] * ray, sides.tolist()
 
 

@@ -86,7 +86,7 @@ def write_visible_share(out: RecordingSink, name: str, curves: Mapping[str, Curv
 
 
 def _write_outside(out: RecordingSink, path: list[str], units: str, curve: Curve, within: Bool) -> None:
-    """Write a cross every `HATCH_S` where an object is outside all fields of view."""
+    """Write a cross every `HATCH_S` on the curve where the object is outside all fields of view of `units`."""
     import rerun as rr
 
     rows = np.flatnonzero(~within & ~np.isnan(curve.share))
@@ -367,7 +367,7 @@ def _write_error_differences(
     out: RecordingSink, replay: Replay, experiment: Experiment, name: str, first: Tracks, second: Tracks,
     shown: Sequence[int], colour: Rgb,
 ) -> None:  # fmt: skip
-    """Write by how many metres an object is farther off (positive) than in the baseline's list of the same instant."""
+    """Write by how many metres an object's position is worse (positive) than in the baseline's list of that instant."""
     for k in shown:
         (mine_ns, mine_m), (other_ns, other_m) = (
             measure_position_error(replay, experiment, k, tracks) for tracks in (first, second)
@@ -375,18 +375,17 @@ def _write_error_differences(
         match = np.searchsorted(other_ns, mine_ns - SAME_INSTANT_NS)
         in_both = match < len(other_ns)
         in_both[in_both] = other_ns[match[in_both]] <= mine_ns[in_both] + SAME_INSTANT_NS
-        more_m = mine_m[in_both] - other_m[match[in_both]]
+        excess_m = mine_m[in_both] - other_m[match[in_both]]
         path = ["plots", "error_difference", entity_names(replay.scene)[k], configuration_part(name)]
-        draw_quartiles(out, path, mine_ns[in_both], more_m, colour)
+        draw_quartiles(out, path, mine_ns[in_both], excess_m, colour)
 
 
 def _write_ways(
     out: RecordingSink, replay: Replay, experiment: Experiment, joined: pd.DataFrame, name: str, baseline: str,
     shown: Sequence[int],
 ) -> None:  # fmt: skip
-    """Write the line between an object's places at the two detections, from the later one on.
-
-    `joined`: a row per object that is in both tables.
+    """Write the line between an object's places at the two detections, from the later one on. `joined`: a row per
+    object that is in both tables.
     """
     import rerun as rr
 
@@ -397,14 +396,14 @@ def _write_ways(
     later_s = ways[["detection_s", "detection_s_baseline"]].max(axis=1)
     ways = ways.assign(later_s=later_s).sort_values("later_s", kind="stable")
     object_ix = ways["object_id"].map(replay.scene.object_number).to_numpy(dtype=np.int64)
-    ends = [
+    places = [
         interpolate_states(
             replay.truth, object_ix, ways[column].to_numpy(), t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
         )
         for column in ("detection_s_baseline", "detection_s")
     ]
-    present = ends[0][1] & ends[1][1]
-    lines = np.stack([stack_float32(column["x_m"], column["y_m"], column["z_m"]) for column, _ in ends], axis=1)[
+    present = places[0][1] & places[1][1]
+    lines = np.stack([stack_float32(column["x_m"], column["y_m"], column["z_m"]) for column, _ in places], axis=1)[
         present
     ]
     ways = ways[present]
@@ -412,10 +411,10 @@ def _write_ways(
     labels = [f"{object_id} {s:+.2f} s to {baseline}" for object_id, s in zip(ways["object_id"], after_s, strict=True)]
     instants, last = np.unique(to_nanoseconds(ways["later_s"])[::-1], return_index=True)
     counts = len(lines) - last  # lines up to each instant: the index of its last one
-    _, way = np.nonzero(np.arange(len(lines)) < counts[:, None])
+    _, line_ix = np.nonzero(np.arange(len(lines)) < counts[:, None])
     path = ["world", configuration_part(name), "difference", "first"]
     strips = rr.LineStrips3D.columns(
-        strips=join_points(lines[way]), labels=pa.array(labels, pa.string()).take(pa.array(way))
+        strips=join_points(lines[line_ix]), labels=pa.array(labels, pa.string()).take(pa.array(line_ix))
     )
     out.columns(path, instants, strips.partition(counts))
     out.static(
@@ -442,7 +441,7 @@ def _is_simultaneous(joined: pd.DataFrame) -> pd.Series:
 
 
 def _difference_sentences(joined: pd.DataFrame, name: str, baseline: str) -> Iterator[tuple[float, str, str]]:
-    """Time (s), level and sentence for every object that at least one of the two configurations knew."""
+    """Time (s), level and sentence on each object that at least one of the two configurations knew."""
     for episode in table_rows(joined):
         name_of_object = f"{episode.object_id} {episode.object_class}"
         if episode.detected and episode.detected_baseline:

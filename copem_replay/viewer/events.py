@@ -132,7 +132,7 @@ def _name_object(episode: Any, scene: Scene) -> str:
 
 
 def _describe_ending(episode: Any, scene: Scene) -> tuple[float, str, str]:
-    """Time (s), level and sentence of one row of the detections."""
+    """Time (s), level and sentence on how one row of the detections ended: known, or never known."""
     name, verdict = _name_object(episode, scene), describe_verdict(episode)
     suffix = f"; the ego {verdict}" if verdict else ""
     if not episode.detected:
@@ -193,7 +193,7 @@ def write_difference_text(
 
 
 def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, str]) -> Iterator[str]:
-    """“Shown: 6 of 49 that count. Of the others never known: object 134, 99 with late.”; nothing where all are here."""
+    """“Shown: 6 of 49 that count. Of the others never known: object 134, 99 with late.”; nothing: all are shown."""
     names, not_shown = (
         counted["configuration"].nunique(),
         counted[~counted["object_id"].isin([scene.object_ids[k] for k in shown])],
@@ -210,6 +210,7 @@ def _describe_others(counted: pd.DataFrame, scene: Scene, shown: Mapping[int, st
 
 
 def _difference_table(episodes: pd.DataFrame, scene: Scene) -> str:
+    """A Markdown table on one object: a row per configuration with when, where, by whom it was known."""
     first = table_rows(episodes)[0]
     braking = bool(getattr(first, "conflict", False))
     head = ["configuration", "after", "at", *(["the ego"] if braking else []), "by"]
@@ -235,7 +236,7 @@ def _tell_outcome(episode: Any) -> str:
 
 
 def _overview_table(by_object: Sequence[pd.DataFrame], scene: Scene) -> str:
-    """A row per configuration, a column per object: time to detection, and **fail** if the ego does not stay clear."""
+    """A row per configuration, a column per object: seconds until known, **fail** where the ego does not stay clear."""
     ids = [short_ids(scene)[scene.object_number[episodes["object_id"].iloc[0]]] for episodes in by_object]
     lines = [f"| known after, s | {' | '.join(map(_escape_cell, ids))} |", "| --- |" + " ---: |" * len(ids)]
     rows_by_object = [{episode.configuration: episode for episode in table_rows(episodes)} for episodes in by_object]
@@ -307,7 +308,7 @@ def write_summary_text(
 
 
 def _markdown_table(frame: pd.DataFrame) -> str:
-    """A Markdown table with a column per row of `frame`, and a row per column."""
+    """A Markdown table with a column for each row of `frame`, and a row for each column."""
 
     def cell(value: object) -> str:
         if value is None or value is pd.NA or (isinstance(value, float) and np.isnan(value)):
@@ -399,14 +400,14 @@ def _write_reference_lines(
     ends = [
         stack_float32(x[rows], y[rows], ground[rows]) for x, y in ((ego.x_m, ego.y_m), (states["x_m"], states["y_m"]))
     ]
-    instants, last = np.unique(to_nanoseconds(time_s[rows])[::-1], return_index=True)
-    counts = len(rows) - last
-    _, mark = np.nonzero(np.arange(len(rows)) < counts[:, None])
-    lines = np.stack(ends, axis=1)[mark]
+    instants, last_of_instant = np.unique(to_nanoseconds(time_s[rows])[::-1], return_index=True)
+    counts = len(rows) - last_of_instant
+    _, line_ix = np.nonzero(np.arange(len(rows)) < counts[:, None])
+    lines = np.stack(ends, axis=1)[line_ix]
     if len(rows) <= LINED:
         out.columns([*path, "line"], instants, rr.LineStrips3D.columns(strips=join_points(lines)).partition(counts))
         out.static([*path, "line"], rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(1.0)))
-    words = pa.array(texts, pa.string()).take(pa.array(rows[mark]))
+    words = pa.array(texts, pa.string()).take(pa.array(rows[line_ix]))
     out.columns(path, instants, rr.Points3D.columns(positions=lines.mean(axis=1), labels=words).partition(counts))
     small = rr.Radius.ui_points(1)
     out.static(path, rr.Points3D.from_fields(colors=[colour], radii=small, show_labels=False))
@@ -429,9 +430,8 @@ def _write_lasting_points(
     out: RecordingSink, path: list[str], replay: Replay, experiment: Experiment, part: pd.DataFrame, column: str,
     texts: Sequence[str], colour: Rgb, *, side: int,
 ) -> None:  # fmt: skip
-    """Write a point per row of `part`, on the object at the instant in column `column`, from that instant on.
-
-    Each row of the entity holds all points up to its instant. `side`: 1 for the top of the box, −1 for the bottom.
+    """Write a point per row of `part`, on the object at the instant in column `column` (s), from that instant on. Each
+    row of the entity holds all points up to its instant. `side`: 1 for the top of the box, −1 for the bottom.
     """
     import rerun as rr
 
@@ -443,10 +443,10 @@ def _write_lasting_points(
     )  # fmt: skip
     place = stack_float32(states["x_m"], states["y_m"], states["z_m"] + side * states["height_m"] / 2)[present]
     words = pa.array(texts, pa.string()).take(pa.array(order[present]))
-    instants, last = np.unique(to_nanoseconds(time_s[present])[::-1], return_index=True)
-    counts = len(place) - last  # marks up to each instant: the index of its last one, from the end
-    _, mark = np.nonzero(np.arange(len(place)) < counts[:, None])
-    columns = rr.Points3D.columns(positions=place[mark], labels=words.take(pa.array(mark)))
+    instants, last_of_instant = np.unique(to_nanoseconds(time_s[present])[::-1], return_index=True)
+    counts = len(place) - last_of_instant  # marks up to each instant: the index of its last one, from the end
+    _, point_ix = np.nonzero(np.arange(len(place)) < counts[:, None])
+    columns = rr.Points3D.columns(positions=place[point_ix], labels=words.take(pa.array(point_ix)))
     out.columns(path, instants, columns.partition(counts))
     size = rr.Radius.ui_points(3)
     out.static(path, rr.Points3D.from_fields(colors=[colour], radii=size, show_labels=False))

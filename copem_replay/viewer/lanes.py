@@ -97,9 +97,8 @@ def _tell_lane(
     begins: Int, texts: list[str | None], tints: Sequence[Rgb], name: str, clock_ns: tuple[int, int],
     axis_ns: tuple[int, int],
 ) -> tuple[Int, list[str | None], dict[str, tuple[str, Rgb]]]:  # fmt: skip
-    """Instants and values of a lane with its name, flag and mark; label and colour of each value.
-
-    `texts`, `tints`: of spans that begin at `begins`. `clock_ns`: onset of the object, and when it is known.
+    """Instants and values of a lane with its name, flag and mark; label and colour of each value. `texts`, `tints`: of
+    spans that begin at `begins`. `clock_ns`: onset of the object, and when it is known; `axis_ns`: begin and end.
     """
     (onset_ns, known_ns), (first_ns, last_ns) = clock_ns, axis_ns
     mark_ns = round((last_ns - first_ns) * MARK)
@@ -163,18 +162,18 @@ def _measure_spans(begins: Int, axis_ns: tuple[int, int], end_ns: int | None = N
 
 
 def _fit_words(texts: Sequence[str | None], points: Float) -> tuple[list[str | None], dict[str, str]]:
-    """Values of states, and the label of each value: as many of its words as fit into its width, unless that is 0.
+    """Values of states, and by value its label: as many words as fit into its width in `points`, all if that is 0.
 
     A state whose words are shortened here and not elsewhere has a space more at the end of its value. Without words the
     label is a space: for an empty one the viewer takes the value.
     """
     values: list[str | None] = []
     label_of = dict.fromkeys(ONSET_IS, " ")
-    for text, wide in zip(texts, points.tolist(), strict=True):
+    for text, width_points in zip(texts, points.tolist(), strict=True):
         if text is None or text in ONSET_IS:
             values.append(text)
             continue
-        room = len(text) if wide <= 0 else int(min((wide - PADDING_POINTS) / LETTER_POINTS, len(text)))
+        room = len(text) if width_points <= 0 else int(min((width_points - PADDING_POINTS) / LETTER_POINTS, len(text)))
         label = next((words for words in _shorten_words(text) if len(words) <= room), _cut_name(text, room))
         value = next(text + k * " " for k in range(len(texts) + 1) if label_of.get(text + k * " ", label) == label)
         label_of[value] = label
@@ -197,7 +196,7 @@ _SHORTER = {
 
 
 def _shorten_words(text: str) -> Iterator[str]:
-    """Words of a span, the longest first.
+    """Shorter and shorter words for a span, the longest first.
 
     “behind car 3 (from ego)”, “behind car 3”, “behind 3”; “PEM, 0.60 s, lost”, “PEM, 0.60 s”, “PEM”; “seen by ego, not
     listed”, “not listed”, “seen”; “out of range or view”, “out of view”, “out”.
@@ -211,8 +210,8 @@ def _shorten_words(text: str) -> Iterator[str]:
     yield re.sub(rf"^behind ({'|'.join(CLASSES)}) ", "behind ", short)
     yield text.partition(" from ")[0]
     yield re.sub("^seen by .*, ", "", text)
-    every = re.findall(r"\w+", text)
-    yield from (words for words in _SHORTER.get(every[0], ()) if {*words.split()} <= {*every})
+    text_words = re.findall(r"\w+", text)
+    yield from (words for words in _SHORTER.get(text_words[0], ()) if {*words.split()} <= {*text_words})
     if flag := re.match(r"-?[0-9.]+ s ", text):
         yield flag[0].rstrip()
 
@@ -260,7 +259,7 @@ def _prepend_title(elapsed_ns: Int, texts: list[str | None], title: str, first_n
 def _insert_onset(
     elapsed_ns: Int, texts: Sequence[str | None], onset_ns: int, mark_ns: int
 ) -> tuple[Int, list[str | None]]:
-    """Instants and texts with a mark before the onset, unless the lane begins later than the mark would."""
+    """Instants (ns) and texts of a lane with a mark before the onset, unless the lane begins later than the mark."""
     begin = onset_ns - mark_ns
     if not elapsed_ns[0] <= begin:
         return elapsed_ns, list(texts)

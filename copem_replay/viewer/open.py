@@ -71,7 +71,7 @@ def opening_s(
 
 
 def _read_opening_s(files: Sequence[Path]) -> dict[Path, float]:
-    """The instant that each recording says; one that says none is left out."""
+    """By recording the instant (s) at which it should open; one that says none, or is unreadable, is left out."""
     from rerun.chunk import RrdReader
 
     instants_s = {}
@@ -88,7 +88,7 @@ def _read_opening_s(files: Sequence[Path]) -> dict[Path, float]:
 
 
 def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought, place: Path) -> dict[Path, float]:
-    """The instant just before the onset of the object sought, by recording that has it."""
+    """By recording with the sought object, the instant (s) just before its onset; empty: results of an old version."""
     instants_s = {}
     try:
         results = open_results(place)
@@ -99,8 +99,8 @@ def _find_onsets_s(folder: Path, files: Sequence[Path], sought: Sought, place: P
                 continue
             log, run = runs[stem]
             (rows,) = results.each(log=log, every=True)
-            of_run = first_episodes(rows[rows["run"] == run])
-            onset_s = of_run.loc[of_run["object_id"] == sought.object_id, "onset_s"]
+            run_rows = first_episodes(rows[rows["run"] == run])
+            onset_s = run_rows.loc[run_rows["object_id"] == sought.object_id, "onset_s"]
             if len(onset_s):
                 instants_s[path] = max(0.0, float(onset_s.min()) - BEFORE_S)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
@@ -172,7 +172,7 @@ def seek_recordings(url: str, instants_s: Mapping[str, float], alive: Callable[[
 
 
 def _set_instants(url: str, instants_s: Mapping[str, float]) -> set[str]:
-    """Set the instants of the recordings that the viewer has loaded. Returns their ids."""
+    """Set the time of those recordings that the viewer has loaded (`instants_s`: by id). Returns their ids."""
     from rerun.experimental import ViewerClient
 
     names: set[str] = set()
@@ -348,7 +348,7 @@ def viewer_files() -> dict[str, bytes]:
 
 @contextmanager
 def _rerun_serving() -> Iterator[str]:
-    """The address of Rerun's own server, for as long as it is needed. With something to show it opens only one port."""
+    """The address of Rerun's own web viewer, which runs as long as the context. Raises OutputError: it cannot start."""
     spec = find_spec("rerun_cli")
     program = shutil.which("rerun", path=str(Path(spec.origin).parent)) if spec and spec.origin else None
     if program is None:
@@ -410,6 +410,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Print no requests: the terminal shows only the address."""
 
     def _answer(self, *, body: bool) -> None:
+        """Answer a request for an asset or a recording, with its `body` or headers alone; 421: foreign host."""
         hosts = self.headers.get_all("Host", [])
         if len(hosts) != 1 or not _OWN_HOSTS.fullmatch(hosts[0].strip()):
             self.send_error(421)

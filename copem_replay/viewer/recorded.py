@@ -123,7 +123,7 @@ def _find_first(files: Collection[Path], topics: Collection[str], column: str) -
 def _read(
     path: Path, topics: Collection[str], from_ns: int | None = None, to_ns: int | None = None
 ) -> Iterator[tuple[str, pa.RecordBatch]]:
-    """Topic and rows, with times and what Rerun draws of them, of messages logged from one instant to another."""
+    """Topic and rows (times and what Rerun draws) of messages logged from `from_ns` to `to_ns`; None: no limit."""
     from rerun.chunk import McapReader
 
     asked, by_entity = [f"^{re.escape(topic)}$" for topic in topics], {_entity(topic): topic for topic in topics}

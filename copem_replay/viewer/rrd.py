@@ -203,9 +203,9 @@ def _build_content(
     episodes = {k: table[table["object_id"] == scene.object_ids[k]] for k in objects}
     axes_s = {k: axis_s(rows, scene.end_s) for k, rows in episodes.items()}
     eye = camera_on_ego(replay, experiment, axes_s, view_aspect(experiment, configurations))
-    large = camera_on_ego(replay, experiment, axes_s, LARGE_ASPECT)
+    large_eye = camera_on_ego(replay, experiment, axes_s, LARGE_ASPECT)
     if eye.turns and eye.aspect != LARGE_ASPECT:
-        large = replace(large, path=(*EYES, "large"))
+        large_eye = replace(large_eye, path=(*EYES, "large"))
     aspect = BESIDE_ASPECTS[len(objects) > 1]
     eyes = [camera_following(replay, experiment, table, k, aspect) for k in objects[:NEAR_BY]]
     onset_s = float(episodes[objects[0]]["onset_s"].iloc[0]) if objects else 0.0
@@ -213,7 +213,7 @@ def _build_content(
     above = camera_above(np.stack([*named_units.values(), eye.at_m], axis=1), eye.heading_rad)
     compared = [rows[rows["configuration"].isin(list(configurations))] for rows in episodes.values()]
     return RecordingContent(
-        replay, experiment, table, episodes, configurations, objects, axes_s, eye, large, eyes, above,
+        replay, experiment, table, episodes, configurations, objects, axes_s, eye, large_eye, eyes, above,
         list(named_units), lists, tuple(dict.fromkeys(baselines.values())), shown.too_short,
         find_opening_s(experiment, compared),
     )  # fmt: skip
@@ -221,20 +221,20 @@ def _build_content(
 
 @contextmanager
 def _open_streams(path: Path, ids: tuple[str, str], t0_ns: int, viewer: str | None) -> Iterator[RecordingSink]:
-    """A sink into the file and, with an address, into the viewer; closed at the end. Raises OutputError."""
+    """A sink into the file and, with the address `viewer`, into the viewer; closed at the end. Raises OutputError."""
     import rerun as rr
 
-    live = None
-    strict = rr.strict_mode()
+    viewer_stream = None
+    was_strict = rr.strict_mode()
     rr.set_strict_mode(True)  # otherwise a wrong column is left out with a warning
     try:
         with file_stream(path, *ids) as rec:
-            live = ViewerStream(viewer, *ids) if viewer is not None else None
-            yield RecordingSink(rec, t0_ns, live)
+            viewer_stream = ViewerStream(viewer, *ids) if viewer is not None else None
+            yield RecordingSink(rec, t0_ns, viewer_stream)
     finally:
-        rr.set_strict_mode(strict)
-        if live is not None:
-            live.close()
+        rr.set_strict_mode(was_strict)
+        if viewer_stream is not None:
+            viewer_stream.close()
 
 
 def _begin_file(file: _RecordingFile, summary: pd.DataFrame, run: int, run_is: str, further: Sequence[str]) -> None:
@@ -382,13 +382,14 @@ def _list_notes(path: Path, parts: Sequence[RecordingPart], lives: Sequence[View
 
 
 def _write_properties(out: RecordingSink, content: RecordingContent, run: int, run_is: str) -> None:
+    """Write the recording's name, start and properties: log, run, seed, configurations, versions, where it opens."""
     import rerun as rr
 
     scene, experiment = content.replay.scene, content.experiment
     name = f"{scene.log}: run {run}" + (f": {run_is}" if run_is else "")
     out.send(lambda rec: rec.send_recording_name(name))
     out.send(lambda rec: rec.send_recording_start_time_nanos(scene.t0_ns))
-    opens: dict[str, Any] = {} if content.opens_s is None else {OPENS: content.opens_s}
+    opening: dict[str, Any] = {} if content.opens_s is None else {OPENS: content.opens_s}
     values = rr.AnyValues(
         log=scene.log,
         run=run,
@@ -396,7 +397,7 @@ def _write_properties(out: RecordingSink, content: RecordingContent, run: int, r
         seed=str(experiment.seed),  # 64 bits without a sign, too
         visibility=experiment.visibility.label,
         configurations=list(content.configurations),
-        **opens,
+        **opening,
         copem_replay=version("copem-replay"),
         rerun_sdk=version("rerun-sdk"),
     )
@@ -410,6 +411,7 @@ def make_rrd_exporter(viewer: str | None) -> Exporter:
     """The exporter of `.rrd` files; it also sends each recording to the Rerun viewer at this address, if any."""
 
     def write(path: Path, run: RunToExport) -> list[str]:
+        """Write one run as a recording at `path`, and to the viewer if there is one. Returns notes for the user."""
         shown = run.replayed.experiment.configurations
         configurations = {name: shown.get(name, configuration) for name, configuration in run.every.items()}
         show = run.replayed.experiment.show
@@ -494,14 +496,14 @@ class TrackCollector:
         self._pieces: dict[str, _TrackPieces] = {}
 
     def add(self, run_tracks: Mapping[str, FusedTracks]) -> None:
-        """Add the next time chunk's fused tracks, by configuration; rows are copied."""
+        """Add the next time chunk's fused tracks, by configuration; rows of the shown objects are copied."""
         for name, fused_tracks in run_tracks.items():
             pieces = self._pieces.setdefault(name, _TrackPieces())
             self._add_received(pieces, fused_tracks)
             rows = np.flatnonzero(self._is_of_objects(fused_tracks.fused))
             count = np.diff(fused_tracks.start)[rows]
-            within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            entries = fused_tracks.entries[np.repeat(fused_tracks.start[rows], count) + within]
+            offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+            entries = fused_tracks.entries[np.repeat(fused_tracks.start[rows], count) + offset]
             pieces.fused.append(fused_tracks.fused.take_rows(rows))
             pieces.source_keys.append(self._key(fused_tracks.received)[entries])
             pieces.count.append(count)
@@ -535,6 +537,7 @@ class TrackCollector:
 
 
 def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
+    """The fused tracks of the shown objects over the whole log, from those of its time chunks."""
     received, order = splice_rows(pieces.received)
     keys = np.concatenate(pieces.keys)[order]
     left_out = np.concatenate(pieces.left_out)[order] if pieces.left_out else None
@@ -542,8 +545,8 @@ def _join_pieces(pieces: _TrackPieces) -> FusedTracks:
     count = np.concatenate(pieces.count)
     begin = np.cumsum(count) - count
     start = np.concatenate([[0], np.cumsum(count[order])])
-    within = np.arange(start[-1]) - np.repeat(start[:-1], count[order])
-    source_keys = np.concatenate(pieces.source_keys)[np.repeat(begin[order], count[order]) + within]
+    offset = np.arange(start[-1]) - np.repeat(start[:-1], count[order])
+    source_keys = np.concatenate(pieces.source_keys)[np.repeat(begin[order], count[order]) + offset]
     by_key = np.argsort(keys, kind="stable")
     entries = by_key[np.searchsorted(keys[by_key], source_keys)]
     said = np.concatenate(pieces.said)[order] if pieces.said else None

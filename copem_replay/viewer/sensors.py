@@ -123,18 +123,18 @@ def unit_places(replay: Replay, experiment: Experiment, lists: Tracks) -> Float:
 
 
 def _locate_recorded_unit(replay: Replay, experiment: Experiment, unit: Unit, time_s: Float) -> Float:
-    """(K, 3) place of a unit with recorded lists: on its carrier, or at its stated place; NaN without either."""
+    """(K, 3) place (m) of a recorded unit: where it is stated, or on its carrier; NaN: neither, or carrier absent."""
     place = np.full((len(time_s), 3), np.nan)
     if unit.at is not None:
         ground_m = unit_ground(replay.truth, "", unit)
         place[:] = (*unit.at, ground_m + (unit.height_m or 0.0))
     elif unit.on is not None:
-        on = np.full(len(time_s), find_carrier(replay.scene, unit))
+        carrier_ix = np.full(len(time_s), find_carrier(replay.scene, unit))
         carrier, present = interpolate_states(
-            replay.truth, on, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
+            replay.truth, carrier_ix, time_s, t0_ns=replay.scene.t0_ns, max_gap_s=experiment.max_gap_s
         )  # fmt: skip
-        high_m = carrier["height_m"] / 2 if unit.height_m is None else unit.height_m - carrier["height_m"] / 2
-        place[present] = np.stack([carrier["x_m"], carrier["y_m"], carrier["z_m"] + high_m], axis=-1)[present]
+        above_centre_m = carrier["height_m"] / 2 if unit.height_m is None else unit.height_m - carrier["height_m"] / 2
+        place[present] = np.stack([carrier["x_m"], carrier["y_m"], carrier["z_m"] + above_centre_m], axis=-1)[present]
     return place
 
 
@@ -153,11 +153,11 @@ def _write_field(
     pem: tuple[Couple, ...],
     height_m: float,
 ) -> None:
-    """The outlines of a field of view on the ground, in the unit's frame, which moves."""
+    """Write outlines of a unit's field of view on the ground, in the unit's moving frame, while it is present."""
     import rerun as rr
 
-    down_m = _ABOVE_GROUND_M - height_m
-    strips = [stack_float32(*line.T, np.full(len(line), down_m)) for line in couple_outlines(pem)]
+    ground_m = _ABOVE_GROUND_M - height_m
+    strips = [stack_float32(*line.T, np.full(len(line), ground_m)) for line in couple_outlines(pem)]
     if not strips or not poses.present.any():
         return
     path, rows = ["world", "fields", name], np.flatnonzero(poses.present)
@@ -172,8 +172,8 @@ def _write_field(
         out.columns(path, elapsed_ns[rows], rr.Transform3D.columns(translation=place, quaternion=turn))
         # The outlines come and go with the carrier: without a transform they would be drawn at the origin.
         changes = np.flatnonzero(np.diff(poses.present, prepend=False))
-        comes = poses.present[changes]
-        lines = rr.LineStrips3D.columns(strips=strips * int(comes.sum())).partition(len(strips) * comes)
+        appears = poses.present[changes]
+        lines = rr.LineStrips3D.columns(strips=strips * int(appears.sum())).partition(len(strips) * appears)
         out.columns(path, elapsed_ns[changes], lines)
         if rows.all() and len(rows) == len(elapsed_ns):
             out.static(path, _field_mesh(strips))
@@ -184,13 +184,13 @@ def _field_mesh(strips: Sequence[np.ndarray]) -> rr.Mesh3D:
     """The area within the outermost outline: triangles from the unit to each piece of the line."""
     import rerun as rr
 
-    arc = max(strips, key=lambda line: float(np.hypot(*line[:, :2].T).max()))
-    count = len(arc)
-    middle = np.array([[0.0, 0.0, arc[0, 2]]], dtype=np.float32)
+    outermost = max(strips, key=lambda line: float(np.hypot(*line[:, :2].T).max()))
+    count = len(outermost)
+    middle = np.array([[0.0, 0.0, outermost[0, 2]]], dtype=np.float32)
     edge = np.arange(count - 1)
     fan = np.stack([np.full(count - 1, count), edge, edge + 1], axis=-1)
     return rr.Mesh3D(
-        vertex_positions=np.concatenate([arc, middle]), triangle_indices=fan, albedo_factor=(*FIELD, FIELD_ALPHA)
+        vertex_positions=np.concatenate([outermost, middle]), triangle_indices=fan, albedo_factor=(*FIELD, FIELD_ALPHA)
     )
 
 
@@ -230,6 +230,7 @@ class FaultsShown:
                     self._write_unit(name, lists, faults, frames)
 
     def _write_unit(self, name: str, lists: Tracks, faults: UnitFaults, frames: Int) -> None:
+        """Write one unit's ghosts, and its outages, at the lists `frames` of a time chunk."""
         import rerun as rr
 
         elapsed_ns = lists.stamp_ns[frames] - self._replay.scene.t0_ns

@@ -93,7 +93,7 @@ def _choose_unit_name(
 def _rename_members(
     experiment: Experiment, configuration: Configuration, unit_names: Mapping[str, str], link_names: Mapping[str, str]
 ) -> Configuration:
-    """A configuration with the names of units and links in the joined experiment."""
+    """The configuration with its units and links called as in the joined experiment; both: new name by old one."""
     changed: dict[str, object] = {}
     if configuration.units != "truth":
         changed["units"] = tuple(unit_names[name] for name in experiment.units_of(configuration))
@@ -226,9 +226,8 @@ def _reread_truth(sides: Sequence[_Side], log: str, experiment: Experiment) -> R
 
 
 def _list_configurations(all_results: Sequence[Results], experiment: Experiment) -> dict[str, Configuration]:
-    """All configurations of all folders in their order, shown ones as in `experiment`.
-
-    Colours depend on this order: configurations of the first folder have the colours of its own files.
+    """By label all configurations of all folders in their order, shown ones as in `experiment`. Colours depend on this
+    order: configurations of the first folder have the colours of its own files.
     """
     labelled = label_configurations(all_results)
     label_of = {(choice.results, choice.configuration): choice.label for choice in labelled}

@@ -99,7 +99,7 @@ def _find_distinct_rows(columns: Int) -> tuple[Int, Int]:
 
 
 def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
-    """“58 behind car 41”; only the name of a known object."""
+    """The words at an object in the scene, such as “58 behind car 41”; of a known object its name alone."""
     _, status, _, _, _, _, near = key
     words = {
         KNOWN: "",
@@ -118,12 +118,12 @@ def _format_label(name: str, unit: str, hider: str, key: list[int]) -> str:
 
 
 def _format_sentence(name: str, unit: str, hider: str, key: list[int]) -> str:
-    """“58 hidden from ego by car 41 (share 0.21)”."""
+    """The status as a sentence, such as “58 hidden from ego by car 41 (share 0.21)”; `key`: numbers it depends on."""
     _, status, _, tenths, hundredths, _, near = key
     if status >= EARLY:
-        old = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
-        after = {EARLY: old, UNCONFIRMED: f"{old}, not confirmed yet", TOO_LATE: f" too late{old}"}
-        return f"{name} known{old}" if status == KNOWN else f"{name} listed{after[status]}"
+        age_text = "" if tenths * 0.1 <= OLD_S else f", {tenths / 10:.1f} s old"
+        words_after = {EARLY: age_text, UNCONFIRMED: f"{age_text}, not confirmed yet", TOO_LATE: f" too late{age_text}"}
+        return f"{name} known{age_text}" if status == KNOWN else f"{name} listed{words_after[status]}"
     if status == UNDER_WAY:
         return f"{name} listed by {unit}, arrives in {tenths / 10:.1f} s"
     if status == UNMATCHED:
@@ -255,7 +255,7 @@ def write_listing_lines(
 
 
 def _is_of_first_unit(lists: Tracks, rows: Int, column: Int, sight: Sight, first_unit: Mapping[int, str]) -> Bool:
-    """(P,) whether each row is of the unit that listed its object first."""
+    """(P,) whether each row is of the unit that listed its object first (`first_unit`; else the first to arrive)."""
     unit = lists.frame_unit_ix[lists.frame_ix[rows]]
     is_first = np.zeros(len(rows), dtype=bool)
     for m, k in enumerate(sight.object_ix.tolist()):

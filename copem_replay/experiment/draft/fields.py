@@ -106,10 +106,10 @@ def _guess_stamp(offers: Collection[str], stamped: Mapping[str, Sequence[str]], 
 
 
 def _guess_object_fields(kind_of: Mapping[str, str]) -> Iterator[tuple[str, list[Any]]]:
-    """By key the fields that an object may have for it, the likeliest first."""
-    plain = {path: what for path, what in kind_of.items() if "[]" not in path}
-    numbers = [path for path, what in plain.items() if what == "number"]
-    yield "id", _match_names(plain, _IDS, _INNER_IDS)
+    """By key of `read:` the paths that an object may have for it, the likeliest first; `kind_of`: by path."""
+    single_values = {path: what for path, what in kind_of.items() if "[]" not in path}
+    numbers = [path for path, what in single_values.items() if what == "number"]
+    yield "id", _match_names(single_values, _IDS, _INNER_IDS)
     yield "class", _guess_classes(kind_of)
     places = [at for at in _guess_vectors(kind_of, _PLACE, bare=True) if not _NO_PLACE.search(at[0].rpartition(".")[0])]
     for k, axis in enumerate(_AXES):
@@ -119,12 +119,12 @@ def _guess_object_fields(kind_of: Mapping[str, str]) -> Iterator[tuple[str, list
     for k, side in enumerate(("length", "width", "height")):
         # a single letter counts only where `l` and `w` are both there: a lone `w` may be of a quaternion
         both = [p for p in numbers if len(p.rpartition(".")[2]) > 1 or {p[:-1] + "l", p[:-1] + "w"} <= {*numbers}]
-        named = _match_names(dict.fromkeys(both, "number"), (side, f"{side}_m", side[0]), ())
-        yield f"{side}_m", named or [at[k] for at in sizes if len(at) > k]
+        named_sides = _match_names(dict.fromkeys(both, "number"), (side, f"{side}_m", side[0]), ())
+        yield f"{side}_m", named_sides or [at[k] for at in sizes if len(at) > k]
     speeds = [at for at in _guess_vectors(kind_of, _SPEED) if not re.search(r"(?i)angular|accel|covar|std", at[0])]
-    flat = [[x, y] for x, y in (("vx", "vy"), ("vx_mps", "vy_mps"), ("vel_x", "vel_y")) if {x, y} <= {*numbers}]
+    flat_speeds = [[x, y] for x, y in (("vx", "vy"), ("vx_mps", "vy_mps"), ("vel_x", "vel_y")) if {x, y} <= {*numbers}]
     for k, axis in enumerate("xy"):
-        yield f"v{axis}_mps", [at[k] for at in [*flat, *speeds]][:1]
+        yield f"v{axis}_mps", [at[k] for at in [*flat_speeds, *speeds]][:1]
 
 
 def _match_names(paths: Mapping[str, str], names: Sequence[str], inner: Sequence[str]) -> list[Any]:
@@ -141,7 +141,7 @@ def _match_names(paths: Mapping[str, str], names: Sequence[str], inner: Sequence
 
 
 def _guess_classes(kind_of: Mapping[str, str]) -> list[Any]:
-    """Fields of the class: plain ones, and fields of a list of guesses, with the probability beside."""
+    """Paths of the class, the likeliest first; one in a list of guesses with the probability beside it."""
     single = _match_names(
         {p: w for p, w in kind_of.items() if "[]" not in p}, _CLASSES, ("label", "class_id", "name", "type")
     )
@@ -159,18 +159,18 @@ def _guess_classes(kind_of: Mapping[str, str]) -> list[Any]:
 
 
 def _guess_vectors(kind_of: Mapping[str, str], kind: str, *, bare: bool = False) -> list[list[str]]:
-    """Vectors: fields x, y, z of a structure named `kind`, `kind_x`, or items of a list; `bare`: of the object too."""
+    """Vectors, by paths of their axes: x, y, z of a structure `kind`, `kind_x`, or list items; `bare`: unnamed too."""
     candidates: dict[str, list[str]] = {}
     for path, what in kind_of.items():
         if what != "number":
             continue
-        head, _, last = path.rpartition(".")
-        name = head.rpartition(".")[2]
+        parent_path, _, last = path.rpartition(".")
+        name = parent_path.rpartition(".")[2]
         axes: Sequence[str] | None = _FLAT.get(last.lower()) if bare else None
         if last == "x" and (re.fullmatch(f"(?i).*{kind}", name) or (bare and name in ("", "pose"))):
             axes = _AXES
         if axes is not None:
-            candidates[path] = [f"{head}.{axis}" if head else axis for axis in axes]
+            candidates[path] = [f"{parent_path}.{axis}" if parent_path else axis for axis in axes]
         elif re.fullmatch(f"(?i){kind}_x(_m)?", last):
             candidates[path] = [re.sub(r"(?i)_x(?=(_m)?$)", f"_{axis}", path) for axis in _AXES]
         elif path.endswith("[]") and path.count("[]") == 1 and re.fullmatch(f"(?i).*{kind}", last.removesuffix("[]")):
@@ -234,6 +234,7 @@ def parse_fields(proposal: ProposalFound) -> Fields:
 
 
 def _propose_channel(log: Log, channel: Channel) -> ProposalFound | None:
+    """A proposal of `read:` for the messages of a channel; None: nothing in them looks like objects."""
     samples = list(itertools.islice(log.payloads(frozenset({channel.number})), _SAMPLES))
     payloads, times = [data for _, _, data in samples], [at for _, at, _ in samples]
     definition = make_definition(channel, payloads)

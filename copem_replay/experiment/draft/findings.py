@@ -240,20 +240,20 @@ def _measure_away(truth: Tracks, ego_ix: int, place_m: Sequence[float] | None) -
 
 
 def _count_began(truth: Tracks, away_m: Float, measured: Bool, range_m: float) -> tuple[dict[str, int], bool]:
-    """How often the objects `measured (N,)` begin how within a range, as `find_episodes` has it, and whether any comes
-    back. A row `away_m (P,)` is NaN where nothing is asked. Who has no frame after its onset does not count.
+    """How many objects `measured (N,)` begin how within `range_m`, as `find_episodes` has it, and whether any comes
+    back. `away_m (P,)` is NaN where nothing is asked. Who has no frame after its onset does not count.
     """
-    objects, time_s, known = truth.row_object_ix, truth.row_captured_s, ~np.isnan(away_m)
+    objects, time_s, is_measured = truth.row_object_ix, truth.row_captured_s, ~np.isnan(away_m)
     first_s, last_s = np.full(len(measured), np.inf), np.full(len(measured), -np.inf)
-    np.minimum.at(first_s, objects[known], time_s[known])
-    np.maximum.at(last_s, objects[known], time_s[known])
-    near = np.flatnonzero((away_m <= range_m) & measured[objects] & (time_s < last_s[objects]))
-    new = np.diff(objects[near], prepend=-1) != 0
-    returned = ~new & (np.diff(time_s[near], prepend=-np.inf) > AGAIN_AFTER_S)
-    onset = near[new | returned]
-    at_once = time_s[onset] <= first_s[objects[onset]]
-    at_once |= returned[new | returned] & (np.diff(truth.frame_ix, prepend=-2)[onset] != 1)
-    at_start = time_s[onset] <= time_s[known].min(initial=np.inf)
+    np.minimum.at(first_s, objects[is_measured], time_s[is_measured])
+    np.maximum.at(last_s, objects[is_measured], time_s[is_measured])
+    near_rows = np.flatnonzero((away_m <= range_m) & measured[objects] & (time_s < last_s[objects]))
+    is_first = np.diff(objects[near_rows], prepend=-1) != 0
+    returned = ~is_first & (np.diff(time_s[near_rows], prepend=-np.inf) > AGAIN_AFTER_S)
+    onset_rows = near_rows[is_first | returned]
+    at_once = time_s[onset_rows] <= first_s[objects[onset_rows]]
+    at_once |= returned[is_first | returned] & (np.diff(truth.frame_ix, prepend=-2)[onset_rows] != 1)
+    at_start = time_s[onset_rows] <= time_s[is_measured].min(initial=np.inf)
     groups = {"crossed": ~at_once, "appeared": at_once & ~at_start, "log_start": at_once & at_start}
     return {word: int(group.sum()) for word, group in groups.items()}, bool(returned.any())
 
@@ -261,7 +261,7 @@ def _count_began(truth: Tracks, away_m: Float, measured: Bool, range_m: float) -
 def _suggest_ego(
     log: Log, recording: Recording, fields: Fields | None
 ) -> tuple[str | dict[str, str] | None, str, Recording]:
-    """The value of `ego`, why, and the recording read with it."""
+    """A value for `ego` (None: leave it out), the reason, and the recording read with it."""
     scene = recording.scene
     if recording.around is not None and recording.around.ego is not None:
         poses = _find_poses(log)
@@ -310,36 +310,35 @@ def _find_poses(log: Log) -> list[dict[str, str]]:
         if len(set(poses.stamp_ns.tolist())) < 2:  # a place, not a way
             continue
         frames = {name.lstrip("/") for name in poses.child}
-        base = next((name for name in _FRAMES if name in frames), None)
+        base_frame = next((name for name in _FRAMES if name in frames), None)
         if frames == {""}:
             ranked.append((1, {"topic": channel.topic}))
-        elif base is not None:
-            ranked.append((2, {"topic": channel.topic, "frame": base}))
+        elif base_frame is not None:
+            ranked.append((2, {"topic": channel.topic, "frame": base_frame}))
     return [place for _, place in sorted(ranked, key=lambda pair: pair[0])]
 
 
 def _find_longest_vehicle(scene: Scene, truth: Tracks) -> tuple[str, str]:
     """The driving vehicle that is in the log for longest, and why; "none" where no other object would be measured.
-
     "none" also where it is there for a part of the log only: that log was recorded from beside the road.
     """
     objects, count = truth.row_object_ix, len(scene.object_ids)
-    low, high = np.full((3, count), np.inf), np.full((3, count), -np.inf)
+    first_values, last_values = np.full((3, count), np.inf), np.full((3, count), -np.inf)
     for k, values in enumerate((truth.row_captured_s, truth.x_m[0], truth.y_m[0])):
-        np.minimum.at(low[k], objects, values)
-        np.maximum.at(high[k], objects, values)
-    there_s, moved = high[0] - low[0], np.hypot(*(high - low)[1:])
+        np.minimum.at(first_values[k], objects, values)
+        np.maximum.at(last_values[k], objects, values)
+    duration_s, moved_m = last_values[0] - first_values[0], np.hypot(*(last_values - first_values)[1:])
     drives = scene.moving & np.isin(scene.object_class, class_indices(_DRIVEN))
     if not drives.any():
         return "none", "there is no vehicle to be the ego"
     if scene.moving.sum() < 2:
         return "none", f"{scene.object_ids[int(drives.argmax())]}, the only one that moves, is measured"
-    best = max(np.flatnonzero(drives), key=lambda k: (moved[k] >= _MOVED_M, there_s[k], moved[k]))
+    best = max(np.flatnonzero(drives), key=lambda k: (moved_m[k] >= _MOVED_M, duration_s[k], moved_m[k]))
     longest = (
         f"of the vehicles that drive, {scene.object_ids[best]} ({CLASSES[scene.object_class[best]]}) "
-        f"is there longest, {low[0, best]:.1f} – {high[0, best]:.1f} s"
+        f"is there longest, {first_values[0, best]:.1f} – {last_values[0, best]:.1f} s"
     )
-    if there_s[best] < _MOSTLY * scene.end_s:
+    if duration_s[best] < _MOSTLY * scene.end_s:
         return "none", f"{longest} of {scene.end_s:.1f} s, and an ego is there nearly all the time"
     return scene.object_ids[best], longest
 
@@ -358,7 +357,7 @@ def _suggest_masts(truth: Tracks, rows: Int, objects: Int) -> list[Mast]:
     step = max(1, len(truth.x_m[0]) // _ROWS)
     everyone = np.stack([truth.x_m[0, ::step], truth.y_m[0, ::step]], axis=1)
     turns = np.deg2rad(np.arange(0, 360, 45))
-    around = [centre + MAST_M * np.array([np.cos(t), np.sin(t)]) for t in turns]
-    free = [float(np.hypot(*(everyone - place).T).min()) for place in around]
-    best = int(np.argmax(np.round(free, 3)))
-    return [Mast([round(float(v), 1) for v in around[k]], 180 - -45 * k % 360) for k in (best, (best + 4) % 8)]
+    mast_places = [centre + MAST_M * np.array([np.cos(t), np.sin(t)]) for t in turns]
+    free_m = [float(np.hypot(*(everyone - place).T).min()) for place in mast_places]
+    freest = int(np.argmax(np.round(free_m, 3)))
+    return [Mast([round(float(v), 1) for v in mast_places[k]], 180 - -45 * k % 360) for k in (freest, (freest + 4) % 8)]

@@ -97,7 +97,7 @@ def survey_recording(place: Local | str) -> RecordingSurvey:
 
 
 def _survey_topics(log: Log) -> list[TopicFound]:
-    """The channels, each with its role."""
+    """The channels of a log, each with its role: truth, unit, poses, map or unread."""
     truths = truth_topics(log)
     lists, poses = set[int](), set[int]()
     if foreign_channels(log):
@@ -117,7 +117,7 @@ def _survey_topics(log: Log) -> list[TopicFound]:
 def _survey_units(
     place: Local, scene: Scene, topics: Sequence[str], recording: Recording | None = None
 ) -> Iterator[UnitFound]:
-    """The lists of each unit, held against the truth where there is a `recording`; `problem`: they cannot be read."""
+    """The lists of each unit, compared with the truth of `recording` (None: none); `problem`: they are unreadable."""
     if topics and recording is not None and recording.place_said is not None:
         with suppress(InputError):  # the line on its place says why
             scene = replace(scene, frame=recording.place_said.read()[0])
@@ -145,7 +145,7 @@ def _survey_sensors(place: Local, topic: str) -> dict[str, Any]:
 
 
 def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> UnitFound:
-    """The lists of a unit: their own properties, and those by comparison with the truth, `known`."""
+    """The lists of a unit: their own properties, and those by comparison with the truth (`known`)."""
     between_s = np.diff(np.unique(recorded.tracks.stamp_ns)) * 1e-9
     lists = len(recorded.tracks.stamp_ns)
     x_m, y_m = recorded.tracks.x_m[0], recorded.tracks.y_m[0]
@@ -165,7 +165,7 @@ def _survey_unit(topic: str, recorded: RecordedLists, known: dict[str, Any]) -> 
 
 
 def _compare_with_truth(recording: Recording, lists: RecordedLists) -> dict[str, Any]:
-    """Delay and oddities of the lists of a unit, as fields of `UnitFound`."""
+    """Delay (s) and oddities of the lists of a unit, as fields of `UnitFound`."""
     from copem_replay.io.recorded_units import (
         assign_truth_ids,
         delay_words,
@@ -174,20 +174,20 @@ def _compare_with_truth(recording: Recording, lists: RecordedLists) -> dict[str,
         shift_captures,
     )
 
-    scene, truth, known, delay_s = recording.scene, recording.truth, dict[str, Any](), 0.0
+    scene, truth, found_fields, delay_s = recording.scene, recording.truth, dict[str, Any](), 0.0
     if not lists.capture_said.all():
         delay = estimate_delay(lists, scene, truth)
-        known["delay"] = delay_words(delay)
+        found_fields["delay"] = delay_words(delay)
         if delay.untold is None:
-            known["delay_s"] = delay_s = round(max(delay.offset_s, 0.0), 3)
-            known["delay_interval_s"] = [round(delay.low_s, 3), round(delay.high_s, 3)]
+            found_fields["delay_s"] = delay_s = round(max(delay.offset_s, 0.0), 3)
+            found_fields["delay_interval_s"] = [round(delay.low_s, 3), round(delay.high_s, 3)]
     shifted = shift_captures(lists, scene, delay_s)
     matched = assign_truth_ids(shifted, scene, truth, gate_m=GATE_M, max_gap_s=MAX_GAP_S)
-    return known | {"oddities": list(describe_oddities(lists, matched.row_object_ix, scene))}
+    return found_fields | {"oddities": list(describe_oddities(lists, matched.row_object_ix, scene))}
 
 
 def _list_proposals(log: Log, topics: Sequence[TopicFound]) -> list[ProposalFound]:
-    """Proposals for channels of unknown schemas, with the truth where they can be read."""
+    """Proposals of `read:` for channels of unknown schemas, with the truth where these can be read."""
     if not foreign_channels(log):
         return []
     from copem_replay.experiment.draft.fields import parse_fields, try_proposals
@@ -209,7 +209,7 @@ def _survey_truth(
     units = [t.topic for t in topics if t.role == "unit" and t.messages]
     units = [name for name in units if name != recording.topic and not name.startswith(_OURS)]
     between_s = np.diff(truth.stamp_ns) * 1e-9
-    longest = int(between_s.argmax()) if len(between_s) else 0
+    longest_ix = int(between_s.argmax()) if len(between_s) else 0
     inside_s = np.diff(truth.row_captured_s)[np.diff(truth.track_ix) == 0]
     found_units = list(_survey_units(recording.local, scene, units, recording))
     return TruthFound(
@@ -219,8 +219,8 @@ def _survey_truth(
         start_ns=scene.t0_ns,
         span_s=round(scene.end_s, 9),
         rate_hz=round(1.0 / float(np.median(between_s)), 3) if len(between_s) else None,
-        longest_gap_s=round(float(between_s[longest]), 9) if len(between_s) else None,
-        longest_gap_at_s=round(float(truth.captured_s[longest]), 9) if len(between_s) else None,
+        longest_gap_s=round(float(between_s[longest_ix]), 9) if len(between_s) else None,
+        longest_gap_at_s=round(float(truth.captured_s[longest_ix]), 9) if len(between_s) else None,
         gaps_inside_tracks=int((inside_s > MAX_GAP_S).sum()),
         x_m=_round_extent(truth.x_m[0]),
         y_m=_round_extent(truth.y_m[0]),
@@ -258,7 +258,7 @@ def _count_ground(recording: Recording) -> dict[str, int]:
 
 
 def _describe_place(log: Log, recording: Recording) -> str:
-    """Where the recording says that it is, or why that is not known, and what fixes beside its odometry say."""
+    """Where on earth the recording says it is, or why that is not known; and what fixes beside its odometry say."""
     if recording.place_said is None:
         none = "none (the recording does not say where on earth it is)"
         return "; ".join([none, *_describe_fixes(log, recording)])
@@ -293,7 +293,7 @@ def _count_by_class(scene: Scene, which: Bool) -> dict[str, int]:
 
 
 def _describe_ego(recording: Recording) -> EgoFound | None:
-    """The ego vehicle that the log names; None: it names none."""
+    """The ego vehicle that the log names, its size (m), from when to when (s); None: it names none."""
     scene, truth = recording.scene, recording.truth
     if scene.ego_ix < 0:
         return None
@@ -314,9 +314,9 @@ def _list_missing(recording: Recording, poses: Sequence[str]) -> list[str]:
     if scene.ego_ix >= 0:
         return []
     host = recording.host_id
-    who = "the log names no host vehicle" if host is None else f"the host vehicle {host} is no moving object"
-    who = find_rule(recording.notes, "two clocks") or who
-    line = f"no ego vehicle: {who}; {_EGO_HINT}, of {moving_ids(scene, shown=6)}"
+    host_words = "the log names no host vehicle" if host is None else f"the host vehicle {host} is no moving object"
+    host_words = find_rule(recording.notes, "two clocks") or host_words
+    line = f"no ego vehicle: {host_words}; {_EGO_HINT}, of {moving_ids(scene, shown=6)}"
     if poses:
         line += f"; or `ego: {{topic: {poses[0]}}}` (poses are on {', '.join(poses)})"
     return [line]
@@ -338,7 +338,7 @@ class ClockFound:
     late: tuple[str, ...] = ()
 
     def words(self) -> str:
-        """The offset in words, `0.130 s (95 %: 0.120 … 0.140 s)`, and the drift; or that they cannot be told."""
+        """`0.130 s (95 %: 0.120 … 0.140 s)`, the offset in words, and the drift; or why it cannot be told."""
         offset = self.offset
         if offset.untold is not None:
             return f"cannot be told: {offset.untold}"
@@ -354,15 +354,15 @@ class ClockFound:
         return words
 
     def plain(self) -> dict[str, object]:
-        """The findings for JSON: seconds, and seconds per second; null where they cannot be told (`untold`)."""
+        """The findings as JSON: offset (s), drift (s/s), intervals; null where they cannot be told (`untold`)."""
         offset = self.offset
-        known = offset.untold is None
+        is_told = offset.untold is None
         return {
             "lists": list(self.lists),
-            "clock_offset_s": offset.offset_s if known else None,
-            "interval_s": [offset.low_s, offset.high_s] if known else None,
-            "drift": offset.drift[0] if known and offset.drift else None,
-            "drift_interval": list(offset.drift[1:]) if known and offset.drift else None,
+            "clock_offset_s": offset.offset_s if is_told else None,
+            "interval_s": [offset.low_s, offset.high_s] if is_told else None,
+            "drift": offset.drift[0] if is_told and offset.drift else None,
+            "drift_interval": list(offset.drift[1:]) if is_told and offset.drift else None,
             "entries": offset.entries,
             "if_not_shifted": offset.unbiased,
             "untold": offset.untold,
@@ -407,7 +407,7 @@ def _find_best(path: Path, first: Sequence[_TimedLists], second: Sequence[_Timed
 
 
 def _read_timed_lists(log: Log, label: str, t0_ns: int) -> Iterator[_TimedLists]:
-    """The object lists of a recording, truths first, in seconds since `t0_ns`, without those that cannot be read."""
+    """The object lists of a recording, truths first, in seconds since `t0_ns`; unreadable ones are left out."""
     from copem_replay.io.recorded_lists import read_unit_lists
     from copem_replay.io.short_tracks import make_list_points
 

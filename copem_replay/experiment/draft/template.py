@@ -120,6 +120,7 @@ def _sum_few(drives: Sequence[_Drive]) -> tuple[str, str] | None:
 
 
 def _draft_head(drives: Sequence[_Drive], units: Sequence[str]) -> Iterator[str]:
+    """The comment at the head of a draft: which drives, who is measured, and commands to go on with."""
     of = _format_comment(drives[0].survey.recording) if len(drives) == 1 else f"{len(drives)} drives"
     span_s = sum(drive.truth.span_s for drive in drives)
     yield f"# Replays {of}, {span_s:.1f} s: {_describe_objects([drive.truth for drive in drives])}."
@@ -150,7 +151,7 @@ def _draft_window(truth: TruthFound) -> str:
 
 
 def _draft_logs(drives: Sequence[_Drive], units: Sequence[str], recorded: Mapping[str, UnitFound]) -> Iterator[str]:
-    """`logs:`, an entry for each, with what is its own: the ego, how it is read, which units, and who counts."""
+    """The lines of `logs:`, an entry for each drive with its own keys: ego, how it is read, units, who counts."""
     yield "logs:   # relative to this file, or absolute; keys of an entry replace those below, in this log only"
     for drive in drives:
         truth = drive.truth
@@ -162,8 +163,8 @@ def _draft_logs(drives: Sequence[_Drive], units: Sequence[str], recorded: Mappin
             "measure": [f"{key}: {of}" for key, of in drive.measured.items() if of != drives[0].measured[key]],
         }
         own_keys += [f"{key}: {{{', '.join(of)}}}" for key, of in changed.items() if of]
-        if _sum_few(drives) is None and (few := _sum_few([drive])) is not None:
-            own_keys.append(f"# all classes are measured here: {few[0]}")
+        if _sum_few(drives) is None and (few_words := _sum_few([drive])) is not None:
+            own_keys.append(f"# all classes are measured here: {few_words[0]}")
         yield from (f"    {line}" for line in own_keys)
 
 
@@ -298,6 +299,7 @@ def _draft_ego(truth: TruthFound, guess: Suggestion) -> Iterator[str]:
 
 
 def _draft_units(drives: Sequence[_Drive], units: Sequence[str], recorded: Mapping[str, UnitFound]) -> Iterator[str]:
+    """The lines of `units:`: the ego's, masts as examples, and lists as they were recorded."""
     if "ego" in units:
         yield "  ego:   # makes a list per frame, or `rate_hz`"
         yield "    on: ego   # on the roof, or at `height_m`"
@@ -321,9 +323,9 @@ def _draft_units(drives: Sequence[_Drive], units: Sequence[str], recorded: Mappi
         yield "  # captured, and how uncertain they are."
     for name, unit in recorded.items():
         yield from (f"  # {_format_comment(line)}" for line in unit.oddities)
-        late = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
+        delay_comment = "" if unit.delay is None else f"   # delay_s {_format_comment(unit.delay)}"
         yield f"  {name}:"
-        yield f"    recorded: {_format_recorded(unit)}{late}"
+        yield f"    recorded: {_format_recorded(unit)}{delay_comment}"
         place, what = dump_on_one_line(unit.middle_m), "where is it? x, y as in the log"
         if unit.views and unit.at_wgs84:
             yield f"    at_wgs84: {dump_on_one_line([*unit.at_wgs84, 0.0])}   # where it says it stands, north ahead"
@@ -354,7 +356,7 @@ def _draft_links(drives: Sequence[_Drive]) -> Iterator[str]:
 
 
 def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iterator[str]:
-    """Configurations: the truth, all units by ideal and by a real fusion, each on its own, and all of them late."""
+    """The lines of `configurations:`: truth, all units by ideal and real fusion, each on its own, and all late."""
     start, gnn = f"{{units: [{', '.join(units)}]", "fusion: {kind: gnn}"
     ego = [name for name in units if name.startswith("ego")]
     others = [name for name in recorded if name not in ego]
@@ -395,12 +397,13 @@ def _counts_all(guess: Suggestion) -> bool:
 
 
 def _draft_measure(drives: Sequence[_Drive]) -> Iterator[str]:
-    guess, keys, few = drives[0].guess, drives[0].measured, _sum_few(drives)
+    """The lines of `measure:`: who is measured, from when on, who counts, and up to when."""
+    guess, keys, few_words = drives[0].guess, drives[0].measured, _sum_few(drives)
     began = sum((Counter(drive.guess.began) for drive in drives), Counter[str]())
     counts_all = any(_counts_all(drive.guess) for drive in drives)
     yield "measure:"
-    if few is not None:
-        yield f"  # {few[1]}"
+    if few_words is not None:
+        yield f"  # {few_words[1]}"
         if not counts_all:
             yield "  # began: [log_start, crossed, appeared]   # with them"
     elif guess.classes:
@@ -429,20 +432,18 @@ def _draft_measure(drives: Sequence[_Drive]) -> Iterator[str]:
 
 
 def _draft_braking(drives: Sequence[_Drive]) -> Iterator[str]:
-    """A driver, where any log has an ego and each ego a known size; without velocities in lists he is not asked when he
-    brakes for nothing.
-    """
+    """The lines of `braking:`, if a log has an ego, behind `#` without its size; no `needless` without velocities."""
     if not any(drive.has_ego for drive in drives):
         return
     from copem_replay.metrics.braking.driver import R157  # a survey alone loads no models
 
-    behind = "# " if any(isinstance(drive.guess.ego, dict) for drive in drives) else ""
+    comment_mark = "# " if any(isinstance(drive.guess.ego, dict) for drive in drives) else ""
     silent = any(unit.problem is None and not unit.velocities_said for drive in drives for unit in drive.truth.units)
-    what = "the careful and competent driver of UN R157" + "; needs the size of the ego" * bool(behind)
-    yield f"{behind}braking:   # who brakes for what lists say: {what}"
-    yield f"{behind}  driver: {dump_on_one_line(R157)}"
+    what = "the careful and competent driver of UN R157" + "; needs the size of the ego" * bool(comment_mark)
+    yield f"{comment_mark}braking:   # who brakes for what lists say: {what}"
+    yield f"{comment_mark}  driver: {dump_on_one_line(R157)}"
     if silent:
-        yield f"{behind}  needless: null   # recorded lists state no velocity: braking for nothing cannot be told"
+        yield f"{comment_mark}  needless: null   # recorded lists state no velocity: braking for nothing cannot be told"
 
 
 def _draft_gap(drives: Sequence[_Drive]) -> Iterator[str]:
@@ -467,10 +468,8 @@ def _find_lists(drive: _Drive, recorded: Mapping[str, UnitFound]) -> dict[str, U
 
 
 def _name_recorded(drives: Sequence[_Drive]) -> tuple[dict[str, UnitFound], dict[str, UnitFound]]:
-    """The lists that could be read, by names made from their topics: those of units, and outputs of a stack.
-
-    Of a topic that several logs have the lists of the first one. An output is the same in all logs, so what only some
-    have is a unit.
+    """The readable lists by names made from their topics: those of units, and the outputs of a stack. Of a topic that
+    several logs have the lists of the first one. An output is the same in all logs, so what only some have is a unit.
     """
     by_topic: dict[str, UnitFound] = {}
     for drive in drives:
@@ -480,14 +479,14 @@ def _name_recorded(drives: Sequence[_Drive]) -> tuple[dict[str, UnitFound], dict
     named: dict[str, UnitFound] = {}
     for unit in by_topic.values():
         words = [word for word in re.split(r"[^a-z0-9]+", unit.topic.lower()) if word]
-        telling = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
-        stem = telling[-1] if telling else "lists"
+        specific_words = [word for word in words if word not in _GENERIC and word[0].isalpha() and word not in _WORDS]
+        stem = specific_words[-1] if specific_words else "lists"
         tries = [stem, *([f"{stem}_recorded"] if stem in _TAKEN else []), *(f"{stem}{k}" for k in range(2, 99))]
         named[next(name for name in tries if name not in _TAKEN and name not in named)] = unit
-    everywhere = {name for name in named if all(name in _find_lists(drive, named) for drive in drives)}
-    fused = {n for n in everywhere if _FUSED & {*re.split(r"[^a-z0-9]+", named[n].topic.lower())}}
-    fused = fused if len(fused) < len(named) else set()
-    return {n: of for n, of in named.items() if n not in fused}, {n: of for n, of in named.items() if n in fused}
+    in_all_logs = {name for name in named if all(name in _find_lists(drive, named) for drive in drives)}
+    outputs = {n for n in in_all_logs if _FUSED & {*re.split(r"[^a-z0-9]+", named[n].topic.lower())}}
+    outputs = outputs if len(outputs) < len(named) else set()
+    return {n: of for n, of in named.items() if n not in outputs}, {n: of for n, of in named.items() if n in outputs}
 
 
 def _format_recorded(unit: UnitFound) -> str:
@@ -537,7 +536,7 @@ def describe_survey(survey: RecordingSurvey, width: int | None = None) -> list[s
 
 
 def _topic_lines(survey: RecordingSurvey, width: int | None) -> list[str]:
-    """The table of topics."""
+    """The lines of the table of topics; two a topic where it is wider than `width` (None: any)."""
     rows = [("topic", "schema", "encoding", "messages", "")]
     rows += [
         (

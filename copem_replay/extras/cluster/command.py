@@ -20,9 +20,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def connect_crew(address: str, parts: PartCache) -> Iterator[Crew]:
-    """The crew at an address. Prints what became of its workers, also after an interrupt.
-
-    Raises CopemError: no scheduler at the address, workers of another version, or workers that do not see the parts.
+    """The crew at an address. Prints what became of its workers, also after an interrupt. Raises CopemError: no
+    scheduler at the address, workers of another version, or workers that do not see the parts.
     """
     with connect_workers(address, parts, count_workers(None)) as workers:
         try:

@@ -97,6 +97,7 @@ def do_task(task: Task) -> Receipt:
 
 
 def _do_task(task: Task, receipt: Receipt) -> Receipt:
+    """Survey a log, or compute its parts, on a worker; the receipt says what came of it. Raises InputError."""
     if other := describe_mismatch(dict(task.fingerprint)):
         raise InputError(f"worker {receipt.host} {other}: results would not be the same bits")
     try:
@@ -109,14 +110,14 @@ def _do_task(task: Task, receipt: Receipt) -> Receipt:
     if refused:
         return replace(receipt, refused=tuple(refused))
     recording = replace(recordings[0], scene=replace(recordings[0].scene, log=task.name))
-    first = StudyLog(recording, experiment, parts)
-    points = [(experiment, first)]
+    first_log = StudyLog(recording, experiment, parts)
+    points = [(experiment, first_log)]
     for point in list_points(experiment):
-        log = first if point.same_units else StudyLog(recording, point.experiment, parts)
+        log = first_log if point.same_units else StudyLog(recording, point.experiment, parts)
         points.append((point.experiment, log))
     if not task.sha256:
         return _survey_log(points, receipt)
-    if first.digests["sha256"] != task.sha256:
+    if first_log.digests["sha256"] != task.sha256:
         raise InputError(f"{task.place}: on worker {receipt.host} it has another content than where the command runs")
     gatherer = Gatherer(1, RunCost(), parts)
     for experiment, log in points:
@@ -223,20 +224,19 @@ class Crew:
         skip_unreadable: bool,
     ) -> dict[str, list[RefusedLog]]:
         """Have workers survey all logs of which facts are missing. Returns why some cannot be replayed, by identity.
-
         Raises CopemError for what is wrong with the experiment, or with the workers.
         """
         surveys = self._plan_surveys(experiment, places, source)
-        whose = {task.name: identity for identity, task in surveys.items()}
-        todo = [task for identity, task in surveys.items() if identity not in self._lost]
+        identity_by_name = {task.name: identity for identity, task in surveys.items()}
+        tasks = [task for identity, task in surveys.items() if identity not in self._lost]
         total = len({place_identity(place) for place in places})
-        self._progress = CrewProgress("surveying", total - len(todo), total)
+        self._progress = CrewProgress("surveying", total - len(tasks), total)
         refused: dict[str, list[RefusedLog]] = {}
         own_settings, problems = settings_by_place(experiment, source), list[str]()
-        for task, receipt in self._do_all(todo):
-            entry, settings = own_settings.get(whose[task.name], (None, None))
+        for task, receipt in self._do_all(tasks):
+            entry, settings = own_settings.get(identity_by_name[task.name], (None, None))
             if receipt.refused:
-                refused[whose[task.name]] = [log.within(entry, settings) for log in receipt.refused]
+                refused[identity_by_name[task.name]] = [log.within(entry, settings) for log in receipt.refused]
             problems += [source.at(receipt.key, line) if receipt.key else line for line in receipt.problems]
         self._parts.store.refresh()
         if problems:
@@ -251,7 +251,7 @@ class Crew:
     def _plan_surveys(
         self, experiment: Experiment, places: Mapping[Place, Key | None], source: ExperimentSource
     ) -> dict[str, Task]:
-        """Surveys of the logs of which facts are missing, by the identities of their places."""
+        """By identity of its place, a survey for each log of which facts are missing."""
         readable = {place_identity(place): place for place in places if refuse_missing(place, None) is None}
         own_settings = settings_by_place(experiment, source)
         own_names = {whose: settings.name for whose, (_, settings) in own_settings.items() if settings.name is not None}
@@ -273,7 +273,6 @@ class Crew:
 
     def fill(self, experiment: Experiment, recordings: Sequence[KnownLog]) -> bool:
         """Have workers compute all missing parts. Returns whether workers died of logs, which the study leaves out.
-
         Raises CopemError for what is wrong with the workers.
         """
         store, tasks, missing = self._parts.store, [], dict[str, list[str]]()
@@ -286,17 +285,17 @@ class Crew:
                 tasks.append(replace(task, sha256=log.digests["sha256"]))
                 missing[log.name] = names
         self._progress = CrewProgress("replaying", len(recordings) - len(tasks), len(recordings))
-        lost_before, computed = len(self._lost), list[str]()
+        lost_before, computed_parts = len(self._lost), list[str]()
         for task, receipt in self._do_all(tasks):
             if receipt.problems or receipt.refused:
                 raise CopemError([*receipt.problems, *(log.said(None) for log in receipt.refused)])
-            computed += missing[task.name]
+            computed_parts += missing[task.name]
         store.refresh()
-        if not all(map(store.exists, computed)):
+        if not all(map(store.exists, computed_parts)):
             why = "what workers keep there is not seen from here, or their own components are of other files"
             raise CopemError(f"{store.where}: {why}; a shared folder or s3://…")
-        self._parts.computed += len(computed)
-        self._parts.found -= len(computed)  # gathering counts them as found
+        self._parts.computed += len(computed_parts)
+        self._parts.found -= len(computed_parts)  # gathering counts them as found
         return len(self._lost) > lost_before
 
     def _make_task(self, experiment: Experiment, name: str, place: Place, settings: LogSettings | None) -> Task:
@@ -338,34 +337,34 @@ class Crew:
         self._tell(self._progress)
 
     def _do_all(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Receipt]]:
-        """The receipts of tasks as they come. A task at which workers died is tried once more, alone."""
-        waiting, suspects, flying = deque(tasks), deque[Task](), dict[Future[Receipt], tuple[Task, bool]]()
+        """The receipts of tasks as they come. A task at which a worker died is tried once more, alone."""
+        waiting, suspected, running = deque(tasks), deque[Task](), dict[Future[Receipt], tuple[Task, bool]]()
         self._report()
         try:
-            while waiting or suspects or flying:
-                source, at_once = (waiting, self._count_threads()) if waiting or flying else (suspects, 1)
-                while source and len(flying) < at_once:
-                    task = source.popleft()
+            while waiting or suspected or running:
+                queue, at_once = (waiting, self._count_threads()) if waiting or running else (suspected, 1)
+                while queue and len(running) < at_once:
+                    task = queue.popleft()
                     if place_identity(task.place) not in self._lost:
                         with self._say_where_it_ends():
-                            flying[self._executor.submit(do_task, task)] = task, at_once == 1
-                finished, _ = wait(flying, TICK_S, FIRST_COMPLETED)
+                            running[self._executor.submit(do_task, task)] = task, at_once == 1
+                finished, _ = wait(running, TICK_S, FIRST_COMPLETED)
                 self._report()
                 for future in finished:
-                    task, was_alone = flying.pop(future)
+                    task, was_alone = running.pop(future)
                     try:
                         receipt = self._receive(future, task)
                     except WorkerDiedError as error:
-                        suspects += [] if was_alone else [task]
+                        suspected += [] if was_alone else [task]
                         self._lost |= {place_identity(task.place): error} if was_alone else {}
                         continue
                     yield task, receipt
                     self._report(1)
         except TaskFailedError:
-            wait(flying)  # running tasks end first
+            wait(running)  # running tasks end first
             raise
         finally:
-            for future in flying:
+            for future in running:
                 future.cancel()
 
     def _count_threads(self) -> int:
@@ -386,7 +385,7 @@ class Crew:
 
     @contextmanager
     def _say_where_it_ends(self) -> Iterator[None]:
-        """Raise CopemError in place of what an executor raises that takes no more tasks, or tells no more of them."""
+        """A context that raises CopemError where the executor takes no more tasks, or tells no more of them."""
         try:
             yield
         except BrokenExecutor as error:
@@ -399,7 +398,7 @@ class Crew:
             raise
 
     def _receive(self, future: Future[Receipt], task: Task) -> Receipt:
-        """The receipt. Raises WorkerDiedError, CopemError, TaskFailedError, and what the executor raises."""
+        """The receipt of a task. Raises WorkerDiedError, CopemError, TaskFailedError, and what the executor raises."""
         try:
             with self._say_where_it_ends():
                 receipt = future.result()

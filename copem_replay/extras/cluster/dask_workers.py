@@ -104,7 +104,7 @@ def _close(close: Callable[..., None], timeout_s: float) -> None:
 
 
 def _connect(address: str, where: Any, timeout_s: float) -> Any:
-    """A client of the scheduler. Raises OSError: no answer; InputError: tls:// without certificates."""
+    """A client of the scheduler at an address, or named in a .json file. Raises OSError: no answer; InputError."""
     import distributed
 
     if Path(address).suffix == ".json":
@@ -119,19 +119,19 @@ def _connect(address: str, where: Any, timeout_s: float) -> Any:
 
 
 def _check_workers(client: Any, address: str, parts: PartCache) -> None:
-    """Raises CopemError where workers differ from this process, or do not see the parts."""
+    """Raise CopemError where workers have other versions than this process, or do not see the parts."""
     token, folder = secrets.token_hex(8), str(Path.cwd())
     parts.store.write(_PROBE, token.encode())
     greetings = client.run(greet_worker, take_fingerprint(), parts.address, folder, token, on_error="return")
     alive = {worker: greeting for worker, greeting in greetings.items() if not isinstance(greeting, OSError)}
-    unlike = [words for worker, greeting in alive.items() if (words := _describe_unlike(worker, greeting))]
-    if unlike:
-        many = f"({len(unlike)} of {len(alive)} workers differ): results would not be the same bits"
-        raise CopemError(f"{address}: worker {unlike[0]} {many}")
+    differences = [words for worker, greeting in alive.items() if (words := _describe_unlike(worker, greeting))]
+    if differences:
+        consequence = f"({len(differences)} of {len(alive)} workers differ): results would not be the same bits"
+        raise CopemError(f"{address}: worker {differences[0]} {consequence}")
     for host, _, sees in alive.values():
         if not sees:
-            out = "--pieces with a shared folder or s3://…"
-            raise CopemError(f"{parts.store.where}: not visible from worker {host}; {out}")
+            advice = "--pieces with a shared folder or s3://…"
+            raise CopemError(f"{parts.store.where}: not visible from worker {host}; {advice}")
 
 
 def greet_worker(expected: dict[str, str], pieces: str, folder: str, token: str) -> tuple[str, str | None, bool]:
@@ -163,7 +163,7 @@ def _read_address(file: Path, until_s: float) -> str:
 
 
 def _check_certificates(address: str) -> None:
-    """Raises InputError where tls:// has no certificates: Dask's client would end 20 s later in a traceback."""
+    """Raise InputError where tls:// has no certificates: Dask's client would end 20 s later in a traceback."""
     import distributed
 
     try:
@@ -172,8 +172,8 @@ def _check_certificates(address: str) -> None:
     except OSError as error:  # no such file, or not a certificate with its key (ssl.SSLError)
         fault = _format_error(error)
     if fault:
-        out = f"set {_TLS}CA_FILE and {_TLS}CLIENT__CERT"
-        raise InputError(f"--cluster: {address}: expected certificates in Dask's settings, found {fault}; {out}")
+        advice = f"set {_TLS}CA_FILE and {_TLS}CLIENT__CERT"
+        raise InputError(f"--cluster: {address}: expected certificates in Dask's settings, found {fault}; {advice}")
 
 
 def _start_local(count: int) -> Any:

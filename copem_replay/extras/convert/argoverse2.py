@@ -103,16 +103,16 @@ def _read_site(log: Path, report: ConversionReport) -> SiteMap:
 
 
 def _find_place(log: Path, report: ConversionReport) -> SaidPlace | None:
-    """The frame of the log's city, which only the names of its maps say; None: they say none."""
+    """The frame of the log's city on earth, which only the names of its maps say; None: they say none."""
     for path in sorted((log / "map").glob("log_map_archive_*.json")):
-        if (named := _CITY.search(path.name)) is None:
+        if (city_match := _CITY.search(path.name)) is None:
             continue
         try:
-            proj, offset_m = read_argoverse2_city(named[1])
+            proj, offset_m = read_argoverse2_city(city_match[1])
         except InputError as error:
             report.count("place on earth", f"left out: {error}")
             return None
-        report.assume(f"place on earth: that of city {named[1]}, by the name of {path.name}")
+        report.assume(f"place on earth: that of city {city_match[1]}, by the name of {path.name}")
         return SaidPlace(proj, offset_m)
     return None
 
@@ -151,7 +151,7 @@ def _group_by_stamp(stamps_ns: Any) -> Iterator[tuple[int, Any]]:
 
 
 def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the columns that are used, (N,) each. Raises InputError."""
+    """The columns that are used, (N,) each, from a feather file. Raises InputError."""
     try:
         table = pyarrow.feather.read_table(path, memory_map=False)
     except FileNotFoundError:
@@ -159,16 +159,16 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...] = (
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path}: expected a feather file, found {str(error).splitlines()[0]}") from None
     expected = ("timestamp_ns", *texts, *numbers)
-    if wrong := [name for name in expected if table.column_names.count(name) != 1]:
-        found = ", ".join(f"{table.column_names.count(name) or 'no'} {name}" for name in wrong)
+    if wrong_columns := [name for name in expected if table.column_names.count(name) != 1]:
+        found = ", ".join(f"{table.column_names.count(name) or 'no'} {name}" for name in wrong_columns)
         raise InputError(f"{path}: expected the columns {', '.join(expected)}, once each; found {found}")
     columns: dict[str, Any] = {}
     for name in expected:
-        kind = pa.int64() if name == "timestamp_ns" else pa.string() if name in texts else pa.float64()
+        arrow_type = pa.int64() if name == "timestamp_ns" else pa.string() if name in texts else pa.float64()
         try:
-            column = table[name].cast(kind)
+            column = table[name].cast(arrow_type)
         except pa.ArrowException:
-            raise InputError(f"{path}: column {name}: expected {kind}, found {table[name].type}") from None
+            raise InputError(f"{path}: column {name}: expected {arrow_type}, found {table[name].type}") from None
         if column.null_count:
             raise InputError(f"{path}: column {name}: expected no gaps, found {column.null_count}")
         columns[name] = column.to_numpy()

@@ -75,9 +75,8 @@ class XmlNode:
 def read_parts(
     path: Path, root_tags: tuple[str, ...], *, most_elements: int | None = None, content: bytes | None = None
 ) -> Iterator[XmlNode]:
-    """Yield the root without its children, then each child once it is complete.
-
-    `most_elements`: of one child. `content`: what is read, None: that of the file. Raises InputError.
+    """Yield the root without its children, then each child once it is complete. `most_elements`: of one child.
+    `content`: what is read, None: that of the file. Raises InputError.
     """
     reading = _ParserHandlers(path, root_tags, most_elements)
     try:
@@ -119,6 +118,7 @@ class _ParserHandlers:
         parser.StartDoctypeDeclHandler = self._doctype
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Begin an element: children of the root are handed out when they end, others are kept. Raises InputError."""
         node = XmlNode(tag, attributes, self.parser.CurrentLineNumber)
         if not self.open:
             if tag not in self.root_tags:
@@ -224,8 +224,8 @@ class _Road:
     def add(self, node: XmlNode) -> None:
         """Add a lanelet, or the crossings of an intersection. Raises InputError."""
         if node.tag == "intersection":
-            crossed = [one for part in node.all("crossing") for one in part.all("crossingLanelet")]
-            self._crossings |= {one.attribute("ref", self._path) for one in crossed}
+            crossed = [item for part in node.all("crossing") for item in part.all("crossingLanelet")]
+            self._crossings |= {item.attribute("ref", self._path) for item in crossed}
             return
         parts = [part.all("point") if (part := node.find(side)) else [] for side in ("leftBound", "rightBound")]
         if min(map(len, parts)) < 2:
@@ -233,8 +233,8 @@ class _Road:
             return
         bounds = [np.array([(*_read_point(point, self._path), 0.0) for point in part]) for part in parts]
         left, right = (check_size(bound, f"{self._path}:{node.line}: <lanelet>") for bound in bounds)
-        name, types = str(_read_id(node, self._path)), [one.text.strip() for one in node.all("laneletType")]
-        kinds: list[LaneKind] = [_LANE_KIND[one] for one in types if one in _LANE_KIND]
+        name, types = str(_read_id(node, self._path)), [item.text.strip() for item in node.all("laneletType")]
+        kinds: list[LaneKind] = [_LANE_KIND[item] for item in types if item in _LANE_KIND]
         self._lanes[name] = Lane(name, kinds[0] if kinds else "driving", left, right)
         if "crosswalk" in types:
             self._crossings.add(name)
@@ -283,6 +283,7 @@ def _map_kind(node: XmlNode, path: Path, report: ConversionReport, *, moving: bo
 
 
 def _read_shape(node: XmlNode, path: Path, report: ConversionReport) -> _Shape | None:
+    """The size of an obstacle and its place in it; None: it has another shape than is read, which is counted."""
     shape = node.find("shape")
     children = shape.children if shape is not None else []
     if len(children) != 1 or children[0].tag not in ("rectangle", "circle", "polygon"):
@@ -300,8 +301,8 @@ def _read_shape(node: XmlNode, path: Path, report: ConversionReport) -> _Shape |
     length, width = (
         parse_positive(_read_text(drawn, path, tag), f"{path}:{drawn.line}: {tag}") for tag in ("length", "width")
     )
-    turned = drawn.find("orientation")
-    yaw_rad = _read_value(turned, path, report) if turned is not None else 0.0
+    orientation = drawn.find("orientation")
+    yaw_rad = _read_value(orientation, path, report) if orientation is not None else 0.0
     return _Shape(length, width, x, y, yaw_rad)
 
 
@@ -340,7 +341,7 @@ def _read_time(state: XmlNode, path: Path) -> int:
 def _make_box(
     ident: int, kind: OsiKind, shape: _Shape, state: XmlNode, path: Path, report: ConversionReport, *, moving: bool
 ) -> Box | None:
-    """Return the obstacle in a state; None: the state has no position."""
+    """The box of an obstacle in a state; None: the state has no position, which is counted."""
     place = state.find("position")
     point = next((child for child in place.children), None) if place is not None else None
     if point is not None and point.tag in ("rectangle", "circle"):
@@ -352,10 +353,10 @@ def _make_box(
         report.count("state", "without a point as position: skipped")
         return None
     x, y = _read_point(point, path, parse_number_or_none)
-    turned, speed = state.find("orientation"), state.find("velocity")
-    if turned is None:
+    orientation, speed = state.find("orientation"), state.find("velocity")
+    if orientation is None:
         report.count("state", "without orientation: 0 taken")
-    yaw_rad = _read_value(turned, path, report) if turned is not None else 0.0
+    yaw_rad = _read_value(orientation, path, report) if orientation is not None else 0.0
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     at_m = (x + cos * shape.x_m - sin * shape.y_m, y + sin * shape.x_m + cos * shape.y_m, kind.height_m / 2)
     velocity = None

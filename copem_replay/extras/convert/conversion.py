@@ -101,9 +101,8 @@ KINDS: Final[dict[str, OsiKind]] = {
 
 
 def kind_from_name(name: str) -> OsiKind | None:
-    """The kind that a name of a source means, by the table of class names; None: it says nothing.
-
-    Of the kinds of a class that whose own name is in it: a `SEMITRACTOR` is a tractor, a `traffic_cone` a cone.
+    """The kind that a name of a source means, by the table of class names; None: it says nothing. Of the kinds of a
+    class that whose own name is in it: a `SEMITRACTOR` is a tractor, a `traffic_cone` a cone.
     """
     if name in KINDS:
         return KINDS[name]
@@ -163,7 +162,6 @@ def parse_number(text: object, where: str) -> float:
 
 def parse_number_or_none(text: object, where: str) -> float:
     """Return a number of an object's state, NaN where it is none: the state is left out or completed, and counted.
-
     Raises InputError: a text that is none.
     """
     return value if abs(value := _parse_float(text, where)) <= LARGEST_M else math.nan
@@ -311,7 +309,7 @@ def write_recording(
 def _encode_messages(
     frames: Iterable[ConvertedFrame], report: ConversionReport, source: Path, format_name: str, record: dict[str, str]
 ) -> Iterator[tuple[str, GroundTruth]]:
-    """Encode frame by frame; `record` is filled after the last, since only then all names are known."""
+    """Topic and message of each frame; `record` is filled after the last, as only then all names are known."""
     last_ns = -1
     for frame in frames:
         if not last_ns < frame.stamp_ns <= LAST_SECOND * NANOS_PER_SECOND:
@@ -332,6 +330,7 @@ def _encode_messages(
 
 
 def _encode_message(frame: ConvertedFrame, report: ConversionReport) -> GroundTruth:
+    """The message of a frame: place on earth, road, and its boxes; those with no number are left out, counted."""
     osi = empty_ground_truth(frame.stamp_ns, frame.host)
     if frame.place is not None:
         osi.proj_string, offset = frame.place.proj, osi.proj_frame_offset
@@ -363,22 +362,23 @@ def _complete_size(box: Box, report: ConversionReport) -> tuple[float, float, fl
 
 
 def _add_box(osi: Any, box: Box, size_m: tuple[float, float, float]) -> None:
-    new = (osi.moving_object if box.kind.moving else osi.stationary_object).add()
-    new.id.value = box.id
-    base = new.base
+    """Add a box to a message as a moving or stationary object of `size_m`."""
+    osi_object = (osi.moving_object if box.kind.moving else osi.stationary_object).add()
+    osi_object.id.value = box.id
+    base = osi_object.base
     base.dimension.length, base.dimension.width, base.dimension.height = size_m
     base.position.x, base.position.y, base.position.z = box.at_m
     base.orientation.roll, base.orientation.pitch, base.orientation.yaw = 0.0, 0.0, box.yaw_rad
     if not box.kind.moving:
-        new.classification.type = box.kind.type
+        osi_object.classification.type = box.kind.type
         return
-    new.type = box.kind.type
+    osi_object.type = box.kind.type
     if box.kind.vehicle is not None:
-        new.vehicle_classification.type = box.kind.vehicle
+        osi_object.vehicle_classification.type = box.kind.vehicle
     if box.velocity_mps is not None and all(map(math.isfinite, box.velocity_mps)):
         base.velocity.x, base.velocity.y, base.velocity.z = *box.velocity_mps, 0.0
     if box.rear_axle_m is not None:
-        rear = new.vehicle_attributes.bbcenter_to_rear
+        rear = osi_object.vehicle_attributes.bbcenter_to_rear
         rear.x, rear.y, rear.z = box.rear_axle_m
 
 

@@ -80,6 +80,7 @@ def frames(path: Path, report: ConversionReport) -> Iterator[ConvertedFrame]:
 
 
 def _make_box(row: _BoxRow, ident: int, report: ConversionReport, *, moves: bool) -> Box:
+    """The box of a row; a missing height or z is that of its class; `moves`: the object does in some row."""
     kind = row.kind
     if moves != kind.moving:
         kind = KINDS["other"] if moves else OsiKind("static", False, KINDS["static"].type, like=kind.like)
@@ -88,12 +89,13 @@ def _make_box(row: _BoxRow, ident: int, report: ConversionReport, *, moves: bool
         report.count("row", "without height_m: the typical height of the class taken")
     if row.z_m is None:
         report.count("row", "without z_m: stood on z = 0")
-    said_m = abs(height_m) if 0.0 < abs(height_m) <= LONGEST_M else kind.height_m
-    z_m = said_m / 2 if row.z_m is None else row.z_m
+    stated_height_m = abs(height_m) if 0.0 < abs(height_m) <= LONGEST_M else kind.height_m
+    z_m = stated_height_m / 2 if row.z_m is None else row.z_m
     return Box(ident, kind, (*row.at_m, z_m), row.yaw_rad, (*row.size_m, height_m), row.velocity_mps)
 
 
 def _read_rows(path: Path, report: ConversionReport) -> Iterator[_BoxRow]:
+    """The rows of a table. Raises InputError."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             lines = csv.reader(stream, strict=True)
@@ -115,6 +117,7 @@ def _read_rows(path: Path, report: ConversionReport) -> Iterator[_BoxRow]:
 
 
 def _check_header(header: list[str], path: Path) -> None:
+    """Raise InputError where the header lacks columns, has unknown ones, or one twice."""
     where = f"{path}:1"
     if missing := [name for name in REQUIRED if name not in header]:
         found = ", ".join(header[:20]) or "nothing"
@@ -134,7 +137,7 @@ def _check_header(header: list[str], path: Path) -> None:
 
 
 def _parse_row(cells: dict[str, str], where: str, line: int, report: ConversionReport) -> _BoxRow:
-    """Parse a row. An empty cell of an optional column counts as no such column."""
+    """The values of a row. An empty cell of an optional column counts as no such column. Raises InputError."""
 
     def given(name: str) -> float | None:
         return parse_number_or_none(cells[name], f"{where}: {name}") if cells.get(name) else None

@@ -70,7 +70,7 @@ def list_recordings(source: Path) -> dict[str, PlannedRecording]:
 
 
 def _find_tables(source: Path) -> Path:
-    """The folder with the tables: this one, or the only one of a version below. Raises InputError."""
+    """The folder with the tables: this one, or the only one of a version below. Raises InputError: none or several."""
     if (source / "scene.json").is_file():
         return source
     folders = sorted(
@@ -87,7 +87,7 @@ def _find_tables(source: Path) -> Path:
 
 
 def _read_rows(path: Path, *texts: str) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table, which have these texts. Raises InputError."""
+    """The rows of a table, each with `texts`, keys that have to be texts. Raises InputError."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -178,7 +178,7 @@ def _read_tables(folder: Path, _signature: object) -> _Tables:
 
 
 def _read_ego_poses(folder: Path, stamp_us: Mapping[str, float]) -> dict[str, tuple[Float, Float]]:
-    """The pose of the ego vehicle at each key frame: that of the lidar's, or else of the sensor nearest in time."""
+    """By key frame the ego's position and quaternion: those of the lidar's data, else of the sensor nearest in time."""
     lidars = {
         row["token"] for row in _read_rows(folder / "sensor.json", "token", "modality") if row["modality"] == "lidar"
     }
@@ -187,22 +187,22 @@ def _read_ego_poses(folder: Path, stamp_us: Mapping[str, float]) -> dict[str, tu
         for row in _read_rows(folder / "calibrated_sensor.json", "token", "sensor_token")
         if row["sensor_token"] in lidars
     }
-    best: dict[str, tuple[bool, float, str, str]] = {}
+    best_pose: dict[str, tuple[bool, float, str, str]] = {}
     path = folder / "sample_data.json"
     texts = ("token", "sample_token", "ego_pose_token", "calibrated_sensor_token")
     for number, row in enumerate(_read_rows(path, *texts), start=1):
         if row.get("is_key_frame") and (sample := row["sample_token"]) in stamp_us:
             apart = abs(_read_stamp(row, f"{path}: row {number}") - stamp_us[sample])
             rank = (row["calibrated_sensor_token"] not in by_lidar, apart, row["token"], row["ego_pose_token"])
-            best[sample] = min(best.get(sample, rank), rank)
-    wanted = {pose for *_, pose in best.values()}
+            best_pose[sample] = min(best_pose.get(sample, rank), rank)
+    wanted = {pose for *_, pose in best_pose.values()}
     path, poses = folder / "ego_pose.json", dict[str, tuple[Float, Float]]()
     for number, row in enumerate(_read_rows(path, "token"), start=1):
         if row["token"] in wanted:
             where = f"{path}: row {number}"
             position, quaternion = _read_vectors(row, ("translation", "rotation"), where)
             poses[row["token"]] = position, quaternion
-    return {sample: poses[pose] for sample, (*_, pose) in best.items() if pose in poses}
+    return {sample: poses[pose] for sample, (*_, pose) in best_pose.items() if pose in poses}
 
 
 def _read_locations(folder: Path) -> dict[str, str]:
@@ -249,9 +249,8 @@ def frames(
     ego_size_m: tuple[float, float, float] = EGO_SIZE_M,
     ego_centre_m: float = EGO_CENTRE_M,
 ) -> Iterator[ConvertedFrame]:
-    """A scene with the ego vehicle as host. Raises InputError.
-
-    `scene`: its token, None: there is only one. `rate_hz`: of the frames between key frames, None: none.
+    """A scene with the ego vehicle as host. Raises InputError. `scene`: its token, None: there is only one. `rate_hz`:
+    of the frames between key frames, None: none.
     """
     folder = _find_tables(source)
     tables = _read_tables(folder, sign_files(folder.glob("*.json")))
@@ -287,11 +286,11 @@ def _place_objects(
     ego_size_m: tuple[float, float, float],
     ego_centre_m: float,
 ) -> dict[int, _Pose]:
-    """All objects of a key frame by id; `ids` is filled."""
+    """All objects of a key frame by number, the ego as 1; `ids` gets the numbers of new ones."""
     at_m, quaternion = tables.ego[sample.token]
     yaw_rad = _find_yaws(quaternion[None])[0]
-    ahead = [ego_centre_m * math.cos(yaw_rad), ego_centre_m * math.sin(yaw_rad), ego_size_m[2] / 2]
-    objects = {1: _Pose(KINDS["car"], np.array([*(at_m + ahead), yaw_rad, *ego_size_m]))}
+    centre_offset_m = [ego_centre_m * math.cos(yaw_rad), ego_centre_m * math.sin(yaw_rad), ego_size_m[2] / 2]
+    objects = {1: _Pose(KINDS["car"], np.array([*(at_m + centre_offset_m), yaw_rad, *ego_size_m]))}
     boxes = tables.boxes.get(sample.token, [])
     yaws = _find_yaws(np.array([values[6:] for _, values in boxes]).reshape(-1, 4))
     for (instance, values), yaw_rad in zip(boxes, yaws, strict=True):
@@ -311,15 +310,15 @@ def _find_yaws(quaternions: Float) -> Float:
 def _fill_between(
     keys: list[tuple[int, dict[int, _Pose]]], rate_hz: float | None, report: ConversionReport
 ) -> Iterator[tuple[int, list[Box]]]:
-    """Key frames, and frames between two: of objects that both have, in straight lines, turned the short way."""
+    """Time (ns) and boxes of key frames, and between two, of objects that both have, in straight lines."""
     interpolated = 0
     for k, (stamp_ns, objects) in enumerate(keys):
         yield stamp_ns, [_make_box(number, pose.kind, pose.values) for number, pose in objects.items()]
         later_ns, after = keys[k + 1] if k + 1 < len(keys) else (stamp_ns, {})
-        whole_ns = later_ns - stamp_ns
-        if rate_hz is None or not 0 < whole_ns <= _LONGEST_NS:
+        gap_ns = later_ns - stamp_ns
+        if rate_hz is None or not 0 < gap_ns <= _LONGEST_NS:
             continue
-        parts = max(1, round(whole_ns * rate_hz / 1e9))
+        parts = max(1, round(gap_ns * rate_hz / 1e9))
         pairs = [
             (number, pose, after[number].values - pose.values) for number, pose in objects.items() if number in after
         ]
@@ -329,7 +328,7 @@ def _fill_between(
             boxes = [
                 _make_box(number, pose.kind, pose.values + change * part / parts) for number, pose, change in pairs
             ]
-            yield stamp_ns + whole_ns * part // parts, boxes
+            yield stamp_ns + gap_ns * part // parts, boxes
         interpolated += parts - 1
     if interpolated:
         report.assume(
@@ -352,7 +351,7 @@ def _make_box(number: int, kind: OsiKind, values: Float) -> Box:
 def _read_lanes(
     source: Path, folder: Path, location: str, keys: list[tuple[int, dict[int, _Pose]]], report: ConversionReport
 ) -> list[Float]:
-    """Outlines of lanes of the map expansion near the ego's path, (K, 3) each, at the ego's height; none without it."""
+    """Outlines (K, 3) of lanes near the ego's path, from the map expansion, at the ego's height; none without it."""
     places = (root / "maps" / "expansion" / f"{quote(location)}.json" for root in (source, folder.parent))
     path = next((path for path in places if location and path.is_file()), None)
     if path is None or not keys:
@@ -363,11 +362,11 @@ def _read_lanes(
     nodes = {row["token"]: (row["x"], row["y"]) for row in document["node"]}
     rings = {row["token"]: row["exterior_node_tokens"] for row in document["polygon"]}
     driven_m = np.array([objects[1].values[:3] for _, objects in keys])
-    near = shapely.box(*driven_m[:, :2].min(axis=0) - _NEAR_M, *driven_m[:, :2].max(axis=0) + _NEAR_M)
+    near_box = shapely.box(*driven_m[:, :2].min(axis=0) - _NEAR_M, *driven_m[:, :2].max(axis=0) + _NEAR_M)
     lines = list[Float]()
     for lane in document["lane"]:
         ring = [nodes[token] for token in rings.get(lane["polygon_token"], ()) if token in nodes]
-        if len(ring) > 2 and (outline := shapely.LineString([*ring, ring[0]])).intersects(near):
+        if len(ring) > 2 and (outline := shapely.LineString([*ring, ring[0]])).intersects(near_box):
             points = shapely.get_coordinates(outline.simplify(0.05))
             lines.append(np.column_stack([points, np.full(len(points), driven_m[0, 2] - keys[0][1][1].values[6] / 2)]))
     report.count(

@@ -92,7 +92,7 @@ def _system_items(systems: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _read_matrix(pose: Any, where: str) -> Float:
-    """(4, 4) from a matrix, or from a quaternion x y z w and a translation. Raises InputError."""
+    """The (4, 4) matrix of a pose: of `matrix4x4`, or of a quaternion x y z w and a translation. Raises InputError."""
     pose = pose if isinstance(pose, dict) else {}
     if (flat := pose.get("matrix4x4")) is not None:
         matrix = _read_numbers(flat, 16, where).reshape(4, 4)
@@ -105,9 +105,9 @@ def _read_matrix(pose: Any, where: str) -> Float:
         raise InputError(
             f"{where}: expected matrix4x4, or quaternion and translation, found {', '.join(pose) or 'none'}"
         )
-    turned, last = matrix[:3, :3], [0, 0, 0, 1]
-    moved = np.isfinite(matrix).all() and np.abs(turned).max() < 2 and np.allclose(matrix[3], last)
-    if not moved or not np.allclose(turned @ turned.T, np.eye(3), atol=1e-3):
+    rotation, last = matrix[:3, :3], [0, 0, 0, 1]
+    is_finite = np.isfinite(matrix).all() and np.abs(rotation).max() < 2 and np.allclose(matrix[3], last)
+    if not is_finite or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
         raise InputError(f"{where}: expected a rotation and a translation, found another matrix")
     return matrix
 
@@ -169,7 +169,7 @@ def _list_files(path: Path) -> list[Path]:
 
 
 def _read_labels(path: Path, rate_hz: float | None, target: str | None) -> Iterator[_Labels]:
-    """Yield the frames of one file. Raises InputError."""
+    """The frames of one file, with poses and types; `target`: the output's system, None: the root. InputError."""
     root = _read_root(path)
     systems = root.get("coordinate_systems") or {}
     poses = read_poses(systems, f"{path}: coordinate_systems")
@@ -189,6 +189,7 @@ def _read_labels(path: Path, rate_hz: float | None, target: str | None) -> Itera
 
 
 def _read_root(path: Path) -> dict[str, Any]:
+    """The content of `openlabel` in a file. Raises InputError: no JSON, or no frames."""
     try:
         document = parse_json(path.read_bytes())
     except OSError as error:
@@ -216,7 +217,7 @@ def _frame_stamp(timestamp: Any, key: str, rate_hz: float | None, where: str) ->
 def _make_box(
     ident: int, name: str, labelled: Any, frame: _Labels, report: ConversionReport, source: str | None
 ) -> Box | None:
-    """One object of a frame; None: it has no usable cuboid."""
+    """One object of a frame as a box; None: it has no usable cuboid, which is counted."""
     where = f"{frame.where}: object {name}"
     data = labelled.get("object_data") if isinstance(labelled, dict) else None
     if not isinstance(data, dict) or not data:
@@ -255,7 +256,7 @@ def _read_rotation(values: list[float]) -> Float:
 
 
 def _transform_to_target(system: str | None, frame: _Labels, where: str, report: ConversionReport) -> Float:
-    """(4, 4) matrix from the system of a cuboid to that of the output."""
+    """(4, 4) matrix from the system of a cuboid to that of the output; what is assumed goes to the report."""
     if system is None:
         report.assume("cuboids name no coordinate system: taken as they are")
         return np.eye(4)

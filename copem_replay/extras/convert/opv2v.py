@@ -121,7 +121,7 @@ def _read_scenario(scenario: Path) -> dict[str, dict[int, _AgentFrame]]:
 
 
 def _read_frame(path: Path) -> _AgentFrame:
-    """One file. Raises InputError."""
+    """What an agent's file says of one frame: its pose, its lidar's, and the objects it labels. Raises InputError."""
     data = _read_keys(path)
     on_roof = "true_ego_pos" not in data
     key = "lidar_pose" if on_roof else "true_ego_pos"
@@ -138,7 +138,7 @@ def _read_frame(path: Path) -> _AgentFrame:
 
 
 def _read_keys(path: Path) -> dict[str, Any]:
-    """What is used of a file; cameras and plans, most of it, are not parsed. Raises InputError."""
+    """The keys of a file that are used; cameras and plans, most of it, are not parsed. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
@@ -172,6 +172,7 @@ def _read_pose(value: Any, where: str) -> tuple[Float, bool]:
 
 
 def _read_label(value: Any, where: str) -> _Label:
+    """The pose, size (m) and class of a labelled object. Raises InputError."""
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected location, center, angle and extent, found {quote_value(value)}")
     location, angle = (
@@ -188,11 +189,11 @@ def _read_label(value: Any, where: str) -> _Label:
 
 
 def _find_step_s(scenario: Path, numbers: list[int], rate_hz: float | None) -> Decimal:
-    """Seconds of a step of the frames' numbers. Raises InputError."""
+    """Seconds from one frame number to the next: by `rate_hz`, else by the simulation's step. Raises InputError."""
     steps = {later - number for number, later in pairwise(numbers)}
-    least = min(steps, default=1)
+    least_step = min(steps, default=1)
     if rate_hz is not None:
-        return 1 / Decimal(str(rate_hz)) / least
+        return 1 / Decimal(str(rate_hz)) / least_step
     if (path := scenario / _PROTOCOL).is_file():
         try:
             data, _, _ = parse_yaml(path.read_text(encoding="utf-8"))
@@ -204,14 +205,14 @@ def _find_step_s(scenario: Path, numbers: list[int], rate_hz: float | None) -> D
             if not 1e-4 <= step_s <= 10:
                 raise InputError(f"{path}: fixed_delta_seconds: expected 0.0001 to 10 s, found {step_s:g}")
             return Decimal(str(step_s))
-    return 1 / Decimal(RATE_HZ) / least
+    return 1 / Decimal(RATE_HZ) / least_step
 
 
 # Who is who.
 
 
 def _find_own_labels(agents: Scenario, vehicles: list[str], united: UnitedLabels) -> dict[str, str]:
-    """The id under which others label each vehicle: what is where it is, in most frames that have both."""
+    """By vehicle the id under which others label it: the object at its place in most frames that have both."""
     ids: dict[str, str] = {}
     for name in vehicles:
         shared, at_place = Counter[str](), Counter[str]()
@@ -360,6 +361,7 @@ def _say_what_is_assumed(
     step_s: Decimal,
     right_handed: bool,
 ) -> None:
+    """Report what is assumed about axes, time, truth and each agent; `fixed`: those of infrastructure."""
     sign = 1.0 if right_handed else -1.0
     if right_handed:
         report.assume("axes: y to the left, taken as they are (--axes left: CARLA's)")
@@ -375,8 +377,8 @@ def _say_what_is_assumed(
             place = f"[{x:.2f}, {sign * y:.2f}], height_m: {z:.2f}, yaw_deg: {math.degrees(sign * yaw_rad):.1f}"
             report.assume(f"agent {name}: infrastructure, no object; its lidar, for a unit: at: {place}")
         elif name in own_labels:
-            known = name if name == own_labels[name] else f"{name} (object {own_labels[name]})"
-            report.assume(f"agent {known}: an object, of the size that others label")
+            agent_words = name if name == own_labels[name] else f"{name} (object {own_labels[name]})"
+            report.assume(f"agent {agent_words}: an object, of the size that others label")
         else:
             size = "×".join(f"{v:g}" for v in _SIZE_M)
             report.assume(f"agent {name}: an object of {size} m, as no other labels it")

@@ -149,6 +149,7 @@ def frames(
 
 
 def _find_type(node: XmlNode, types: dict[str, VehicleType], report: ConversionReport) -> VehicleType:
+    """The type of a vehicle or person; one that is not in `types` has the size of its class, counted."""
     name = node.attributes.get("type", "")
     # A vehicle whose parameters were changed has a type of its own, `type@vehicle`.
     for candidate in (name, name.rpartition("@")[0]):
@@ -163,6 +164,7 @@ def _find_type(node: XmlNode, types: dict[str, VehicleType], report: ConversionR
 
 
 def _make_box(ident: int, node: XmlNode, kind: VehicleType, path: Path, report: ConversionReport) -> Box:
+    """The box of one state; x and y of a vehicle are the middle of its front, so its centre is behind them."""
     x, y, angle_deg = (
         parse_number_or_none(node.attribute(name, path), f"{path}:{node.line}: {name}") for name in ("x", "y", "angle")
     )

@@ -101,6 +101,7 @@ def frames(
 
 
 def _make_box(label: Any, ids: dict[str, int], R: Float, t: Float, where: str, report: ConversionReport) -> Box:
+    """The box of one label, moved to the world by R (3, 3) and t (3,). Raises InputError."""
     if not isinstance(label, dict):
         raise InputError(f"{where}: expected an object, found {quote_value(label)}")
     track = label.get("track_id")
@@ -135,7 +136,7 @@ def _say_where_infrastructure_is(source: Path, frame: str, report: ConversionRep
 
 @lru_cache(maxsize=1)
 def _read_sequences(source: Path, _signature: object) -> dict[str, list[_FramePair]]:
-    """The pairs of frames of each sequence of the vehicle, in order of time. Raises InputError."""
+    """By sequence of the vehicle its pairs of frames, in order of time. Raises InputError."""
     stamps_ns: dict[str, int] = {}
     path = source / _FRAMES
     for number, row in enumerate(_read_list(path), start=1):
@@ -188,7 +189,7 @@ def _read_list(path: Path) -> list[Any]:
 
 
 def _read_pose(folder: Path, chain: tuple[str, ...], frame: str) -> tuple[Float, Float]:
-    """The rotation (3, 3) and translation (3,) of a chain of calibrations, the last of them applied first."""
+    """The rotation (3, 3) and translation (3,) of a chain of calibrations, the last of which is applied first."""
     R, t = np.eye(3), np.zeros(3)
     for name in chain:
         path = folder / name / f"{frame}.json"
@@ -197,11 +198,11 @@ def _read_pose(folder: Path, chain: tuple[str, ...], frame: str) -> tuple[Float,
         rotation = _read_numbers(
             calibration.get("rotation") if isinstance(calibration, dict) else None, 9, f"{path}: rotation"
         )
-        moved = _read_numbers(calibration.get("translation"), 3, f"{path}: translation")
-        turned = rotation.reshape(3, 3)
-        if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-2):
+        translation = _read_numbers(calibration.get("translation"), 3, f"{path}: translation")
+        matrix = rotation.reshape(3, 3)
+        if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-2):
             raise InputError(f"{path}: rotation: expected a rotation, found another matrix")
-        R, t = R @ turned, R @ moved + t
+        R, t = R @ matrix, R @ translation + t
     return R, t
 
 

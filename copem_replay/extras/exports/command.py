@@ -27,9 +27,8 @@ def export(
         Path | None, typer.Option(metavar="DIR", help="Folder of the files [FOLDER/geojson, …/trackeval, …/nuscenes].")
     ] = None,
 ) -> int:
-    """Write results in formats of other tools.
-
-    GeoJSON has longitudes and latitudes: only of logs whose place on earth is known (`frame`).
+    """Write results in formats of other tools. GeoJSON has longitudes and latitudes: only of logs whose place on earth
+    is known (`frame`).
     """
     from copem_replay.extras.exports.geojson import write_geojson
     from copem_replay.extras.exports.track_files import write_nuscenes, write_trackeval

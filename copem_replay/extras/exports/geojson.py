@@ -33,9 +33,8 @@ _EPISODE: Final = ["log", "object_id", "onset_s", "ended_s"]
 
 
 def write_geojson(results: Results | Path, out: Path | None = None) -> tuple[list[Path], list[str]]:
-    """Write the three files of a results folder; their paths, and notes on logs that are left out.
-
-    `out`: a folder; None: `geojson` in the results folder. Raises InputError where no log has a place on earth.
+    """Write the three files of a results folder; their paths, and notes on logs that are left out. `out`: a folder;
+    None: `geojson` in the results folder. Raises InputError where no log has a place on earth.
     """
     results = results if isinstance(results, Results) else open_results(results)
     features: dict[str, list[dict[str, Any]]] = {name: [] for name in FILES}
@@ -95,7 +94,7 @@ def _write_ring(frame: Frame, corners_m: Any, *, hole: bool = False) -> list[lis
 
 
 def _list_units(log: str, experiment: Experiment, frame: Frame) -> Iterator[dict[str, Any]]:
-    """A point for each unit that stands, and the fields of its PEM."""
+    """A point for each unit that stands, and a polygon for each field of view of its PEM."""
     experiment = give_views(experiment)
     for name, unit in experiment.units.items():
         if unit.at is None:
@@ -131,9 +130,9 @@ def _list_episodes(
         k = scene.object_number[str(object_id)]
         time_s = truth.row_captured_s
         of_object = np.flatnonzero((truth.row_object_ix == k) & truth.valid[0])
-        within = of_object[(time_s[of_object] >= onset_s - 1e-9) & (time_s[of_object] <= ended_s + 1e-9)]
-        gaps = np.flatnonzero(np.diff(time_s[within]) > experiment.max_gap_s) + 1
-        at_m = np.stack([truth.x_m[0, within], truth.y_m[0, within]], axis=1)
+        episode_rows = of_object[(time_s[of_object] >= onset_s - 1e-9) & (time_s[of_object] <= ended_s + 1e-9)]
+        gaps = np.flatnonzero(np.diff(time_s[episode_rows]) > experiment.max_gap_s) + 1
+        at_m = np.stack([truth.x_m[0, episode_rows], truth.y_m[0, episode_rows]], axis=1)
         pieces = [_write_places(frame, piece) for piece in np.split(at_m, gaps) if len(piece) > 1]
         if not pieces:
             continue
@@ -163,7 +162,7 @@ def _describe_knowledge(episode: pd.DataFrame) -> dict[str, float | None]:
 
 
 def _list_site(log: str, experiment: Experiment, recording: Recording, frame: Frame) -> Iterator[dict[str, Any]]:
-    """Borders of lanes, areas, and outlines of what hides."""
+    """Features of the site: borders of lanes, areas, and outlines of what hides."""
     for line in recording.lane_boundaries:
         yield _make_feature("LineString", _write_places(frame, line[:, :2]), log=log, what="lane boundary")
     for area in recording.scene.areas:

@@ -144,6 +144,7 @@ def _write_mot(table: pd.DataFrame, *, truth: bool) -> str:
 
 
 def _describe_box(row: dict[str, Any], sample: str) -> dict[str, Any]:
+    """One box as nuScenes has it in tracking results; `sample`: the token of its frame."""
     half = row["yaw_rad"] / 2
     return {
         "sample_token": sample,
@@ -191,35 +192,35 @@ def collect_held(results: Results, log: str, run: int) -> TrackedRun:
 def _take_truth(
     truth: Tracks, scene: Scene, frame_s: Float, frame_ix: Int, spans: Sequence[tuple[int, float, float]]
 ) -> pd.DataFrame:
-    """States of the measured objects at the frames of the truth that are kept (G,)."""
+    """A table of the measured objects' states at the frames `frame_ix (G,)`, within their `spans` (s)."""
     order, bounds = truth.by_frame
     rows = [order[bounds[frame] : bounds[frame + 1]] for frame in frame_ix.tolist()]
     frames = np.repeat(np.arange(len(frame_ix)), [len(of) for of in rows])
-    flat = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
-    counts = truth.valid[0, flat] & _is_measured(truth.row_object_ix[flat], frame_s[frames], spans)
-    flat, frames = flat[counts], frames[counts]
-    objects = truth.row_object_ix[flat]
+    truth_rows = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
+    is_counted = truth.valid[0, truth_rows] & _is_measured(truth.row_object_ix[truth_rows], frame_s[frames], spans)
+    truth_rows, frames = truth_rows[is_counted], frames[is_counted]
+    objects = truth.row_object_ix[truth_rows]
     identity = [scene.object_ids[k] for k in objects.tolist()]
-    return _make_table(truth, flat, frames, identity, scene.object_class[objects], np.ones(len(flat)))
+    return _make_table(truth, truth_rows, frames, identity, scene.object_class[objects], np.ones(len(truth_rows)))
 
 
 def _take_held(
     fused: FusedTracks, scene: Scene, frame_s: Float, spans: Sequence[tuple[int, float, float]], oldest_s: float
 ) -> pd.DataFrame:
-    """Entries of the list held at each instant, about a measured object or none."""
+    """A table of the list held at each instant (up to `oldest_s` old): entries about a measured object or none."""
     tracks, (rows, bounds) = fused.fused, fused.listed_rows
     issue_s = tracks.common_arrives_s
     order = np.argsort(issue_s, kind="stable")
-    newest, fresh = find_newest_lists(issue_s[order], frame_s, oldest_s)
-    lists = np.where((newest >= 0) & fresh, order[newest] if len(order) else -1, -1)
-    taken = [rows[bounds[k] : bounds[k + 1]] if k >= 0 else rows[:0] for k in lists.tolist()]
-    frames = np.repeat(np.arange(len(frame_s)), [len(of) for of in taken])
-    flat = np.concatenate([np.zeros(0, dtype=np.int64), *taken])
+    newest, is_fresh = find_newest_lists(issue_s[order], frame_s, oldest_s)
+    lists = np.where((newest >= 0) & is_fresh, order[newest] if len(order) else -1, -1)
+    rows_by_frame = [rows[bounds[k] : bounds[k + 1]] if k >= 0 else rows[:0] for k in lists.tolist()]
+    frames = np.repeat(np.arange(len(frame_s)), [len(of) for of in rows_by_frame])
+    flat = np.concatenate([np.zeros(0, dtype=np.int64), *rows_by_frame])
     about = tracks.row_object_ix[flat]
-    counts = (about < 0) | _is_measured(about, frame_s[frames], spans)
-    flat, frames = flat[counts], frames[counts]
-    said = fused.said
-    score = np.ones(len(flat)) if said is None else np.nan_to_num(said["existence"][flat], nan=1.0)
+    is_counted = (about < 0) | _is_measured(about, frame_s[frames], spans)
+    flat, frames = flat[is_counted], frames[is_counted]
+    claims = fused.said
+    score = np.ones(len(flat)) if claims is None else np.nan_to_num(claims["existence"][flat], nan=1.0)
     return _make_table(tracks, flat, frames, _name_entries(fused, flat, scene), fused.class_of(scene)[flat], score)
 
 

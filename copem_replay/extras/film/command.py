@@ -20,9 +20,8 @@ def film(
     log: Annotated[str | None, typer.Option(metavar="NAME", help="Log to show [the first].")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Name of the film [FOLDER/film.gif].")] = None,
 ) -> int:
-    """Write ten seconds of an object as a GIF, for slides.
-
-    Plans side by side show what configurations believe, and say whether the object is known, or why it is not.
+    """Write ten seconds of an object as a GIF, for slides. Plans side by side show what configurations believe, and say
+    whether the object is known, or why it is not.
     """
     from copem_replay.extras.film.film import write_film
 

@@ -175,7 +175,6 @@ def _bars_in(plans: int) -> float:
 
 def choose_instants(onset_s: float, end_s: float) -> Float:
     """The instants (T,) of a film of a log that ends at `end_s`: from two seconds before the onset, ten seconds long.
-
     Near the end of the log it begins earlier, and in a shorter log it is shorter. The onset is one of the instants.
     """
     begin_s = max(0.0, min(onset_s - BEFORE_S, end_s - LASTS_S))
@@ -188,29 +187,30 @@ def choose_instants(onset_s: float, end_s: float) -> Float:
 
 
 def _prepare_plot(replayed: ReplayedRun, table: pd.DataFrame, object_id: str, colours: Mapping[str, Rgb]) -> _Plot:
+    """What all frames of the film share: instants, the plan's turn and size, bodies, and what is known."""
     replay, experiment = replayed.replay, replayed.experiment
     scene, object_ix = replay.scene, replay.scene.object_number[object_id]
     onset_s = float(table.loc[table["object_id"] == object_id, "onset_s"].iloc[0])
     time_s = choose_instants(onset_s, scene.end_s)
-    everybody = np.arange(len(scene.object_ids))
+    all_objects = np.arange(len(scene.object_ids))
     states, present = interpolate_states(
-        replay.truth, np.tile(everybody, len(time_s)), np.repeat(time_s, len(everybody)),
+        replay.truth, np.tile(all_objects, len(time_s)), np.repeat(time_s, len(all_objects)),
         t0_ns=scene.t0_ns, max_gap_s=experiment.max_gap_s,
     )  # fmt: skip
-    grid = (len(time_s), len(everybody))
+    grid = (len(time_s), len(all_objects))
     centre_m = np.stack([states["x_m"], states["y_m"]], axis=-1).reshape(*grid, 2)
     corners_m = rectangle_corners(*(states[name] for name in ("x_m", "y_m", "yaw_rad", "length_m", "width_m")))
     corners_m[~present] = np.nan
     *_, sides = _arrange_plans(len(colours))
-    yaw_rad, apart_m = 0.0, np.zeros(2)
+    yaw_rad, ego_offset_m = 0.0, np.zeros(2)
     if scene.ego_ix >= 0:
         at_onset = int(np.argmin(np.abs(time_s - onset_s)))
         yaw_rad = float(np.nan_to_num(states["yaw_rad"].reshape(grid)[at_onset, scene.ego_ix]))
-        apart_m = np.nan_to_num(centre_m[at_onset, scene.ego_ix] - centre_m[at_onset, object_ix])
+        ego_offset_m = np.nan_to_num(centre_m[at_onset, scene.ego_ix] - centre_m[at_onset, object_ix])
     yaw_rad -= math.pi / 2 if sides[1] > sides[0] else 0.0
     turn = np.array([[math.cos(yaw_rad), math.sin(yaw_rad)], [-math.sin(yaw_rad), math.cos(yaw_rad)]])
-    half_m = float(np.clip(((np.abs(turn @ apart_m) / 2 + _MARGIN_M) / sides).max(), _NEAREST_M, _FARTHEST_M))
-    beside_m = np.clip(turn @ apart_m / 2, -_INSIDE * half_m * sides, _INSIDE * half_m * sides)
+    half_m = float(np.clip(((np.abs(turn @ ego_offset_m) / 2 + _MARGIN_M) / sides).max(), _NEAREST_M, _FARTHEST_M))
+    beside_m = np.clip(turn @ ego_offset_m / 2, -_INSIDE * half_m * sides, _INSIDE * half_m * sides)
     followed_m = _hold_ends(centre_m[:, object_ix] @ turn.T) + beside_m
     knowledge = _collect_knowledge(replayed, table, object_ix, colours, time_s)
     bodies_m = corners_m.reshape(*grid, 4, 2) @ turn.T
@@ -229,6 +229,7 @@ def _hold_ends(places_m: Float) -> Float:
 def _collect_knowledge(
     replayed: ReplayedRun, table: pd.DataFrame, object_ix: int, colours: Mapping[str, Rgb], time_s: Float
 ) -> dict[str, _Knowledge]:
+    """By configuration what it has of the object at each instant: lists, whether known, words, units, what hides it."""
     replay, experiment = replayed.replay, replayed.experiment
     sight = compute_sight(replay, experiment, [object_ix], replay.rows_of(np.array([object_ix])))
     run_tracks = replayed.run_tracks.whole()
@@ -252,24 +253,24 @@ def _collect_knowledge(
 
 
 def _find_units(replayed: ReplayedRun, name: str, stamps_ns: Int) -> Float:
-    """(T, U, 2) places of the units of a configuration, as of their newest lists; NaN: no list yet, or absent."""
+    """(T, U, 2) places (m) of a configuration's units as of their newest lists; NaN: no list yet, or absent."""
     experiment, placed = replayed.experiment, replayed.replay.placed
-    asked = experiment.configurations[name]
-    heard = [] if asked.units == TRUTH else experiment.units_of(asked)
-    units = [unit for unit in heard if len(placed.stamps_ns.get(unit, ()))]
+    configuration = experiment.configurations[name]
+    unit_names = [] if configuration.units == TRUTH else experiment.units_of(configuration)
+    units = [unit for unit in unit_names if len(placed.stamps_ns.get(unit, ()))]
     places_m = np.full((len(stamps_ns), len(units), 2), np.nan)
     for u, unit in enumerate(units):
         newest = np.searchsorted(placed.stamps_ns[unit], stamps_ns, side="right") - 1
-        there = (newest >= 0) & placed.poses[unit].present[newest]
+        is_there = (newest >= 0) & placed.poses[unit].present[newest]
         for axis, column in enumerate((placed.poses[unit].x_m, placed.poses[unit].y_m)):
-            places_m[there, u, axis] = column[newest[there]]
+            places_m[is_there, u, axis] = column[newest[is_there]]
     return places_m
 
 
 def _choose_words(
     replayed: ReplayedRun, sight: Sight, statuses: Status, clock: EpisodeClocks, rows: Int, status: Int
 ) -> list[str]:
-    """The words (T,) on the object at rows (T,) of its statuses: “behind 41”, “known 0.60 s after the onset”."""
+    """(T,) the words at the object at rows of its statuses: “behind 41”, “known after 0.60 s”."""
     scene, object_ix = replayed.replay.scene, int(sight.object_ix[0])
     onset_ns, known_ns = int(clock.onset_ns[object_ix]), int(clock.known_ns[object_ix])
     column = np.zeros(len(rows), dtype=np.int64)
@@ -315,7 +316,7 @@ def _new_figure() -> Figure:
 
 
 def _draw_frames(figure: Figure, plot: _Plot) -> Iterator[None]:
-    """Draw frame after frame into the figure."""
+    """Draw frame after frame into the figure; yields once each is complete."""
     names = list(plot.knowledge)
     rows, columns, _ = _arrange_plans(len(names))
     bottom = _bars_in(len(names)) / _SIZE_IN[1]
@@ -326,10 +327,10 @@ def _draw_frames(figure: Figure, plot: _Plot) -> Iterator[None]:
     title = figure.text(0.5, 0.975, "", ha="center", va="top", fontsize=12, color=_INK)
     bars = _KnownBars(figure.add_axes((0.16, 0.36 / _SIZE_IN[1], 0.82, bottom - 0.5 / _SIZE_IN[1])), plot)
     scene = plot.replayed.replay.scene
-    about = f"{CLASSES[int(scene.object_class[plot.object_ix])]} {short_ids(scene)[plot.object_ix]}"
+    object_words = f"{CLASSES[int(scene.object_class[plot.object_ix])]} {short_ids(scene)[plot.object_ix]}"
     for frame, time_s in enumerate((plot.time_s - plot.onset_s).tolist()):
-        when = f"{time_s:.1f} s after it counts" if time_s > -1e-6 else f"{-time_s:.1f} s before it counts"
-        title.set_text(f"{about}, {when.replace('-0.0', '0.0')}")
+        time_words = f"{time_s:.1f} s after it counts" if time_s > -1e-6 else f"{-time_s:.1f} s before it counts"
+        title.set_text(f"{object_words}, {time_words.replace('-0.0', '0.0')}")
         for panel in panels:
             panel.show(frame)
         bars.show(frame)
@@ -375,15 +376,15 @@ class _Panel:
         axes.text(0.97 - scale / 2, 0.055, "10 m", transform=axes.transAxes, ha="center", fontsize=7, color=_GREY)
 
     def show(self, frame: int) -> None:
-        """Draw one frame."""
+        """Draw frame number `frame` into the panel."""
         plot, knowledge, ego_ix = self._plot, self._knowledge, self._plot.replayed.replay.scene.ego_ix
         x, y = plot.centre_m[frame].tolist()
         self._axes.set_xlim(x - self._half_m[0], x + self._half_m[0])
         self._axes.set_ylim(y - self._half_m[1], y + self._half_m[1])
         bodies = plot.bodies_m[frame]
-        there = np.isfinite(bodies).all(axis=(1, 2))
-        self._truth.set_verts(list(bodies[there]))
-        self._ego.set_verts(list(bodies[ego_ix : ego_ix + 1][there[ego_ix : ego_ix + 1]]) if ego_ix >= 0 else [])
+        is_there = np.isfinite(bodies).all(axis=(1, 2))
+        self._truth.set_verts(list(bodies[is_there]))
+        self._ego.set_verts(list(bodies[ego_ix : ego_ix + 1][is_there[ego_ix : ego_ix + 1]]) if ego_ix >= 0 else [])
         self._fused.set_verts(list(self._fused_boxes(frame)))
         self._hiding.set_data(*plot.place(knowledge.hiding_m[frame]).T)
         self._ring.set_data(*bodies[plot.object_ix].mean(axis=0)[:, None])

@@ -149,9 +149,8 @@ def check_fit_options(
 
 
 def read_study_to_fit(source: ExperimentSource, unit: str) -> LoadedStudy:
-    """An experiment and its recordings; the lists of `unit` need no stated covariance, for the fit estimates it.
-
-    Raises InputError: the experiment has no such unit.
+    """An experiment and its recordings; the lists of `unit` need no stated covariance, for the fit estimates it. Raises
+    InputError: the experiment has no such unit.
     """
     units = source.data.get("units")
     if isinstance(units, dict) and unit not in units:
@@ -179,7 +178,7 @@ def fit_study(study: LoadedStudy, unit: str, options: Any) -> FittedPem:
 
 
 def _add_covariance(data: dict[str, Any], unit: str) -> dict[str, Any]:
-    """Data of an experiment in which the recorded unit states a covariance, at the top level and in every log."""
+    """The experiment's data with a covariance of the recorded unit, in `units` and each log, where none is stated."""
 
     def with_covariance(units: Any) -> Any:
         keys = units.get(unit) if isinstance(units, dict) else None

@@ -99,7 +99,6 @@ def fit_detection_memory(
     sequences: Sequences, *, intervals: bool = True, instead: Sequence[Sequences] = ()
 ) -> DetectionMemoryFit:
     """Share and correlation time of the greatest likelihood, given the probabilities of detection, or one of `instead`.
-
     Correlation times from a third of the period up to twenty of the longest pass are tried; the last is `always`.
     """
     length_s = np.add.reduceat(sequences.gap_s, sequences.start[:-1]).max()
@@ -137,9 +136,8 @@ def fit_detection_memory(
 
 
 def design_effect(share: float, tau_s: float, sequences: Sequences) -> float:
-    """The factor by which the mean of the lists of a pass varies more than that of independent lists.
-
-    1 + 2 Σ (1 − k/m) s²φᵏ over passes of m lists, for any gaps between them.
+    """The factor by which the mean of the lists of a pass varies more than that of independent lists. 1 + 2 Σ (1 − k/m)
+    s²φᵏ over passes of m lists, for any gaps between them.
     """
     total = 0.0
     for a, b in zip(sequences.start[:-1], sequences.start[1:], strict=True):
@@ -196,7 +194,7 @@ class DetectionCouple:
         return ", ".join(parts)
 
     def model(self) -> dict[str, Any]:
-        """The detection model as the experiment file has it."""
+        """The detection model as keys of the experiment: one probability, or a table by range and visible share."""
         values = [
             [CommentedValue(round(float(np.clip(one.value, _KEEP_OFF, 1 - _KEEP_OFF)), 4), one.words()) for one in row]
             for row in self.probability
@@ -226,7 +224,7 @@ class DetectionFit:
     notes: tuple[str, ...]
 
     def probability(self, view: ViewGeometry) -> Float:
-        """(P,) the probability that each row is listed, regardless of memory."""
+        """(P,) the probability that each row is listed, without memory, from its couple's table; 0: no couple."""
         out = np.zeros(len(view.range_m))
         couple_ix = _first_that_holds([couple.when for couple in self.couples], view)
         for k, couple in enumerate(self.couples):
@@ -239,7 +237,7 @@ class DetectionFit:
         return out
 
     def memory_keys(self) -> dict[str, list[dict[str, Any]]]:
-        """The memory of detection as the experiment file has it; empty where nothing lasts."""
+        """The key `memory` of detection as in the experiment file; empty: nothing lasts."""
         if self.memory is None:
             return {}
         share, tau_s = self.memory.share, self.memory.correlation_s
@@ -311,9 +309,8 @@ def fit_detection(
 def _choose_memory(
     rows: FitRows, pass_ix: Int, probability: Float, simplest: bool, intervals: bool
 ) -> tuple[DetectionMemoryFit | None, str | None, float | None]:
-    """What lasts, or None and why; and rows per effective row (None: as residuals say).
-
-    A number of each object and one that all objects of the unit share: the likelier, if white noise is refused.
+    """What lasts, or None and why; and rows per effective row (None: not known). Compares a number of each object with
+    one that all objects of the unit share; the likelier is used, if it is much likelier than none.
     """
     if (why := explain_no_memory(rows.listed, pass_ix)) is not None:
         return None, why, None
@@ -363,7 +360,7 @@ class _TableTrial:
     monotone: bool
 
     def choose(self, ladder: list[_Rung], simplest: bool) -> tuple[int, tuple[Rung, ...]]:
-        """The index of the table that is used, from the simplest to the richest, and what each scores."""
+        """The index of the chosen table in `ladder`, which goes from the simplest to the richest, and their scores."""
         starts = pass_starts(self.pass_ix)
 
         def score(k: int, held_out: Bool) -> Float:
@@ -387,15 +384,15 @@ class _TableTrial:
         return rung.rows.chances(self.fit(rung, np.ones(int(self.pass_ix.max()) + 1)))
 
     def build_axes(self, by: tuple[str, ...]) -> list[_Rung]:
-        """Tables from one constant to all axes of `by`, without those that rows are too few to tell from others."""
-        least, single_node = LEAST_ROWS * self.worth, np.zeros(1)
+        """Tables from one constant to nodes on all axes of `by`; an axis with too few rows for two is left out."""
+        rows_per_node, single_node = LEAST_ROWS * self.worth, np.zeros(1)
         values = {"range": self.rows.view.range_m, "visible_share": self.rows.view.visible_share}
         axes, used_names = (single_node, single_node), list[str]()
         ladder = [self._build("constant", axes, [{}])]
         for name in (one for one in by if one in values):
             k = list(values).index(name)
-            most = int(min(len(self.pass_ix) / least, _MOST_NODES[name]))
-            nodes = choose_nodes(values[name], most, least, _DECIMALS[name]) if most > 1 else single_node
+            most = int(min(len(self.pass_ix) / rows_per_node, _MOST_NODES[name]))
+            nodes = choose_nodes(values[name], most, rows_per_node, _DECIMALS[name]) if most > 1 else single_node
             nodes = nodes if len(nodes) > 1 else single_node
             axes = (nodes, axes[1]) if k == 0 else (axes[0], nodes)
             rung = self._build(" × ".join([*used_names, _WORDS[name]]), axes, [{}])
@@ -425,15 +422,15 @@ class _TableTrial:
 
 
 def _split_conditions(rows: FitRows, conditions: list[dict[str, Any]], name: str, least: float) -> list[dict[str, Any]]:
-    """Conditions split by class or azimuth where a part has `least` rows; all other rows are one more condition."""
+    """Conditions split by class or azimuth (`name`) where a part has `least` rows; other rows are one more, {}."""
     if name == "class":
-        finer: list[dict[str, Any]] = [{"classes": (CLASSES[k],)} for k in np.unique(rows.view.class_ix)]
+        finer_conditions: list[dict[str, Any]] = [{"classes": (CLASSES[k],)} for k in np.unique(rows.view.class_ix)]
     else:
         degrees = np.rad2deg(rows.view.azimuth_rad)
         inner = np.round(np.quantile(degrees, np.arange(1, _SECTORS) / _SECTORS))
         edges = np.unique([np.floor(degrees.min()), *inner, np.ceil(degrees.max())]).tolist()
-        finer = [{"azimuth_deg": pair} for pair in pairwise(edges)]
-    parts = [one | other for one, other in product(conditions, finer)]
+        finer_conditions = [{"azimuth_deg": pair} for pair in pairwise(edges)]
+    parts = [one | other for one, other in product(conditions, finer_conditions)]
     size = np.bincount(_first_that_holds([*parts, {}], rows.view), minlength=len(parts) + 1)
     large_parts = [part for part, rows_there in zip(parts, size, strict=False) if rows_there >= least]
     if len(large_parts) + (size.sum() > size[: len(parts)][size[: len(parts)] >= least].sum()) < 2:

@@ -159,18 +159,18 @@ def autocorrelation_figure(fit: Fit) -> Figure:
 
 
 def _mean_products(z: Float, series_ix: Int, at_s: Float, lags: Int, period_s: float) -> tuple[Float, Int]:
-    """(lags, 2) mean products of errors of variance 1 that are `lags` periods apart, ± a half; and how many (lags,)."""
+    """(lags, 2) mean products of standardised errors `lags` periods apart (± half a period); (lags,) how many."""
     out, n = np.zeros((len(lags), 2)), np.zeros(len(lags), dtype=np.int64)
     z = z / np.sqrt((z**2).mean(axis=0))
-    apart_s = 2 * np.ptp(at_s) + (lags[-1] + 1) * period_s
-    key = apart_s * series_ix + at_s  # one axis of time on which series do not meet
+    series_offset_s = 2 * np.ptp(at_s) + (lags[-1] + 1) * period_s
+    key = series_offset_s * series_ix + at_s  # one axis of time on which series do not meet
     for k, lag in enumerate(lags):
         partner = np.searchsorted(key, key + (lag - 0.5) * period_s)
         partner = np.minimum(partner, len(key) - 1)
-        close = (key[partner] - key < (lag + 0.5) * period_s) & (key[partner] > key)
-        n[k] = int(close.sum())
+        is_partner = (key[partner] - key < (lag + 0.5) * period_s) & (key[partner] > key)
+        n[k] = int(is_partner.sum())
         if n[k]:
-            out[k] = (z[close] * z[partner[close]]).mean(axis=0)
+            out[k] = (z[is_partner] * z[partner[is_partner]]).mean(axis=0)
     return out, n
 
 

@@ -65,9 +65,8 @@ def whiten_columns(values: Float, decay: Float, new: Bool, drift: float, constan
 
 @kernel
 def sum_correlations(decay: Float, new: Bool, bin_ix: Int, bins: int, drift: float, constant: float) -> Float:
-    """(2, B) Σ ρ and Σ ρ² over all pairs of rows of a bin, a row with itself as 1.
-
-    A mean is worth n² over the first effective rows, a variance n² over the second.
+    """(2, B) Σ ρ and Σ ρ² over all pairs of rows of a bin, a row with itself as 1. A mean is worth n² over the first
+    effective rows, a variance n² over the second.
     """
     out = np.zeros((2, bins))
     lag_sum, square_sum, count = np.zeros(bins), np.zeros(bins), np.zeros(bins)
@@ -228,7 +227,7 @@ class _MemoryTrial:
         return log_likelihood(self.z, self.series, shares, centred=self.centred)
 
     def climb(self, model: str, starts: Sequence[Float]) -> tuple[Float, float]:
-        """The likeliest parameters (3,) of a model, −∞ and 0 where it has none, and their likelihood."""
+        """The likeliest parameters (3,) of a model from any of `starts` (−∞, 0: absent), and their log-likelihood."""
         free = _FREE[model]
 
         def fill(x: Float) -> Float:
@@ -291,7 +290,7 @@ def fit_error_memory(z: Float, series: ResidualSeries, *, centred: bool, interva
 def _estimate_parts(
     trial: _MemoryTrial, shares: MemoryShares, peak: Float, counted: tuple[int, int]
 ) -> tuple[tuple[LastingPart, ...], str | None]:
-    """The parts with their profile intervals, and what is not told. `counted`: rows and series."""
+    """The lasting parts with profile intervals, and what is not told (None: nothing). `counted`: rows and series."""
     n, count = counted
 
     def estimate(value: float, limits: tuple[float, float]) -> Estimate:

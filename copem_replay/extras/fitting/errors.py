@@ -128,18 +128,18 @@ class ErrorFit:
         return ("along", "across") if self.frame == "line_of_sight" else ("east", "north")
 
     def error_keys(self, bin_: ErrorBin) -> dict[str, Any]:
-        """An error model as the experiment file has it."""
-        xx, xy, yy = (round_digits(one.value) for one in bin_.covariance_m2)
-        within = 0.9999 * np.sqrt(xx * yy)  # rounding must not make it singular
-        xy = round_digits(float(np.clip(xy, -within, within)))
+        """The error model of a bin as keys of the experiment file: mean (m), covariance (m²), tails, other fields."""
+        xx, xy, yy = (round_digits(estimate.value) for estimate in bin_.covariance_m2)
+        largest_xy = 0.9999 * np.sqrt(xx * yy)  # rounding must not make it singular
+        xy = round_digits(float(np.clip(xy, -largest_xy, largest_xy)))
         out: dict[str, Any] = {"kind": "gaussian", "frame": self.frame}
         if self.shape.written:
             nu = self.shape.degrees_of_freedom
             words = f"{nu.words()}; {self.shape.words()}"
             out |= {"kind": "student_t", "degrees_of_freedom": CommentedValue(round_digits(nu.value, 3), words)}
-        first, covariance, second = (one.words() for one in bin_.covariance_m2)
+        first, covariance, second = (estimate.words() for estimate in bin_.covariance_m2)
         out |= {
-            "mean_m": [one.written() for one in bin_.mean_m],
+            "mean_m": [estimate.written() for estimate in bin_.mean_m],
             "covariance_m2": [
                 CommentedValue([xx, xy], f"variance {first}; covariance {covariance}"),
                 CommentedValue([xy, yy], f"variance {second}"),
@@ -149,9 +149,8 @@ class ErrorFit:
         return out | {name: sigma.written() for name in names if (sigma := getattr(self, name)) is not None}
 
     def memory_keys(self) -> dict[str, list[dict[str, Any]]]:
-        """The keys of `memory`; a part of all objects of the unit is what differs between logs, and taken off others.
-
-        It is taken off what is constant, then off what drifts, for a fit of single objects has it in these.
+        """The keys of `memory`. What differs between logs is a part of all objects of the unit, and is taken off the
+        parts of single objects: first the constant one, then those that drift.
         """
         out = {name: [part.keys() for part in parts] for name, parts in self.memory.items() if parts}
         normal_share = gaussian_share(self.shape.degrees_of_freedom.value) if self.shape.written else 1.0
@@ -164,8 +163,8 @@ class ErrorFit:
             remaining -= removed
             words = part.share.words() + (f", of which t keeps {normal_share:.2g}" if self.shape.written else "")
             words += f"; {removed:.3g} of it differs between logs" if removed else ""
-            if (less := round(part.share.value / normal_share - removed, 3)) > 0 or between_logs is None:
-                position.append(part.keys() | {"share": CommentedValue(less, words)})
+            if (remaining_share := round(part.share.value / normal_share - removed, 3)) > 0 or between_logs is None:
+                position.append(part.keys() | {"share": CommentedValue(remaining_share, words)})
         if between_logs is not None:
             words = "between logs: " + " and ".join(f"{one.words()} m" for one in between_logs.sigma_m)
             share = CommentedValue(round(between_logs.share, 3), words)
@@ -235,7 +234,7 @@ def fit_errors(rows: FitRows, *, simplest: bool = False) -> ErrorFit:
 def _choose_model(
     trial: _ModelTrial, start: MemoryShares
 ) -> tuple[Frame, _Model, ErrorMemoryFit, tuple[Rung, ...], tuple[Rung, ...]]:
-    """The frame, the model in it and its memory, and the tables of models and of frames."""
+    """The frame, the model in it, its memory, and the tables that compare models and frames."""
     rows, series = trial.rows, trial.series
     errors: dict[Frame, Float] = {
         "line_of_sight": np.column_stack([rows.along_m, rows.across_m]),
@@ -247,28 +246,28 @@ def _choose_model(
     candidates |= {
         name: bins for name, bins, than in ((_RANGE, by_range, 1), (_SHARE, finer, len(by_range))) if len(bins) > than
     }
-    wide = list(candidates.values())[-1]
-    frame_ix, frames = trial.choose({str(name): (error_m, wide, None) for name, error_m in errors.items()})
+    most_bins = list(candidates.values())[-1]
+    frame_ix, frames = trial.choose({str(name): (error_m, most_bins, None) for name, error_m in errors.items()})
     frame, error_m = list(errors.items())[frame_ix]
     bins_ix, ladder = trial.choose({name: (error_m, bins, None) for name, bins in candidates.items()})
     name, bins = list(candidates.items())[bins_ix]
     memory = _fit_error_memory(error_m, find_bin(rows.view, bins), bins, series, start)
     model: _Model = (error_m, bins, memory.shares)
-    _, last = trial.choose({name: (error_m, bins, None), name + _MEMORY: model})
-    last = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last))
+    _, last_rungs = trial.choose({name: (error_m, bins, None), name + _MEMORY: model})
+    last_rungs = tuple(replace(rung, chosen=k == bool(memory.parts)) for k, rung in enumerate(last_rungs))
     split = class_bins(bins, rows.view, trial.worth)
     if len(split) > len(bins) and not trial.simplest:
         class_memory = _fit_error_memory(error_m, find_bin(rows.view, split), split, series, memory.shares)
         gain = trial.gain((error_m, split, class_memory.shares), model) / len(error_m)
-        better = gain * len(error_m) > float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
-        score = last[bool(memory.parts)].score + gain
-        by_class = Rung(f"{name} and class{_MEMORY}", score, max(-gain, 0.0), 0.0, better, "likelihood")
-        last = (*(replace(rung, chosen=rung.chosen and not better) for rung in last), by_class)
-        model, memory = ((error_m, split, class_memory.shares), class_memory) if better else (model, memory)
+        class_is_better = gain * len(error_m) > float(chi2.ppf(0.95, 5 * (len(split) - len(bins)))) / 2
+        score = last_rungs[bool(memory.parts)].score + gain
+        by_class = Rung(f"{name} and class{_MEMORY}", score, max(-gain, 0.0), 0.0, class_is_better, "likelihood")
+        last_rungs = (*(replace(rung, chosen=rung.chosen and not class_is_better) for rung in last_rungs), by_class)
+        model, memory = ((error_m, split, class_memory.shares), class_memory) if class_is_better else (model, memory)
     if trial.simplest and memory.parts:
         memory = ErrorMemoryFit(log_likelihood=memory.log_likelihood, untold="the simplest model was asked for")
-        last = tuple(replace(rung, chosen=k == 0) for k, rung in enumerate(last))
-    return frame, model, memory, (*(rung for rung in ladder if not rung.chosen), *last), frames
+        last_rungs = tuple(replace(rung, chosen=k == 0) for k, rung in enumerate(last_rungs))
+    return frame, model, memory, (*(rung for rung in ladder if not rung.chosen), *last_rungs), frames
 
 
 def _fit_spreads(
@@ -324,7 +323,7 @@ class _ModelTrial:
     simplest: bool
 
     def choose(self, models: Mapping[str, _Model]) -> tuple[int, tuple[Rung, ...]]:
-        """The index of the model that is written, from the simplest to the richest, and the table of all."""
+        """The index of the chosen model, from the simplest to the richest, and the table that compares them."""
         rows = self.rows
         _, first, pass_of_row = np.unique(rows.pass_ix, return_index=True, return_inverse=True)
         candidates = list(models.values())
@@ -346,7 +345,7 @@ class _ModelTrial:
         return float(self._scores(model, whole, whole).sum() - self._scores(base, whole, whole).sum())
 
     def _scores(self, model: _Model, train: Any, test: Any) -> Float:
-        """Log-likelihood of each of the rows `test` given those before it, fitted to the rows `train`."""
+        """Log-likelihood of each row `test`, given those before it, by the model fitted to the rows `train`."""
         error_m, bins, memory = model
         bin_ix = find_bin(self.rows.view, bins)
         fitted, scored = build_series(self.rows.take(train)), build_series(self.rows.take(test))
@@ -373,21 +372,21 @@ def _explain_no_gaussian(listed: NDArray[Any], backwards: Bool) -> str | None:
 def _fit_spread(
     values: Float, rows: FitRows, *, simplest: bool
 ) -> tuple[Estimate | None, tuple[LastingPart, ...], str | None]:
-    """The common standard deviation about 0 of columns (n, C), the parts that last, and why something is not fitted."""
-    finite = np.asarray(np.isfinite(values).all(axis=1))
-    n, C = int(finite.sum()), values.shape[1]
+    """The standard deviation about 0 of columns (n, C) taken together, its lasting parts, and why it is not fitted."""
+    is_finite = np.asarray(np.isfinite(values).all(axis=1))
+    n, C = int(is_finite.sum()), values.shape[1]
     if n < FEWEST:
-        none = f"the lists have {'only some of its fields' if np.isfinite(values).any() else 'no such field'}"
-        return None, (), none if n == 0 else f"{n} entries have it"
-    sigma = float(np.sqrt((values[finite] ** 2).mean()))
+        why_none = f"the lists have {'only some of its fields' if np.isfinite(values).any() else 'no such field'}"
+        return None, (), why_none if n == 0 else f"{n} entries have it"
+    sigma = float(np.sqrt((values[is_finite] ** 2).mean()))
     if sigma < 1e-9:
         return None, (), "it is exact"
-    series = build_series(rows.take(finite))
-    memory = ErrorMemoryFit() if simplest else fit_error_memory(values[finite] / sigma, series, centred=False)
+    series = build_series(rows.take(is_finite))
+    memory = ErrorMemoryFit() if simplest else fit_error_memory(values[is_finite] / sigma, series, centred=False)
     shares = memory.shares
     zeros = np.zeros(n, dtype=np.int64)
     _, twice = sum_correlations(series.decay(shares.tau_s), series.new, zeros, 1, shares.drift, shares.constant)
-    phi = np.mean([lag_one_correlation(column, series.new) for column in values[finite].T])
+    phi = np.mean([lag_one_correlation(column, series.new) for column in values[is_finite].T])
     freedom = C * min(n**2 / float(twice[0]), n * (1 - phi**2) / (1 + phi**2))
     square = estimate_variance(sigma**2, C * n, freedom)
     return (
@@ -400,25 +399,25 @@ def _fit_spread(
 def _measure_shape(
     z: Float, series: ResidualSeries, shares: MemoryShares, between: BetweenLogs | None, simplest: bool
 ) -> ErrorShape:
-    """The shape of standardised errors (n, 2), by what is new in each of them given those before."""
-    new, _ = whiten_series(z, series, shares)
-    squares = (new**2).sum(axis=1)
+    """How heavy the tails of standardised errors (n, 2) are: Student's t with its degrees of freedom, by likelihood."""
+    innovations, _ = whiten_series(z, series, shares)
+    squares = (innovations**2).sum(axis=1)
     n = len(squares)
     kurtosis = float((((z - z.mean(axis=0)) / z.std(axis=0)) ** 4).mean()) - 3
 
     def of(x: Float) -> float:
-        nu, scale = np.exp(x)
-        log = gammaln(nu / 2 + 1) - gammaln(nu / 2) - np.log(nu * np.pi * scale)
-        return float(n * log - (nu / 2 + 1) * np.log1p(squares / (nu * scale)).sum())
+        freedom, scale = np.exp(x)
+        log = gammaln(freedom / 2 + 1) - gammaln(freedom / 2) - np.log(freedom * np.pi * scale)
+        return float(n * log - (freedom / 2 + 1) * np.log1p(squares / (freedom * scale)).sum())
 
     bounds = (np.log(_FREEDOMS), np.log([1e-3, 1e3]))
     pairs = [(float(low), float(high)) for low, high in bounds]
     best, value = maximise_likelihood(of, [(np.log(4.0), -0.5), (np.log(20.0), 0.0)], pairs)
     gain = value + n * (np.log(np.pi * squares.mean()) + 1)
-    nu = float(np.exp(best[0]))
-    low, high = np.exp(profile_limits(of, best, value, 0, pairs)) if gain > DROP else (nu, np.inf)
-    estimate = Estimate(nu, float(low), float(high), n, float(n))
-    normal_share = gaussian_share(nu)
+    freedom = float(np.exp(best[0]))
+    low, high = np.exp(profile_limits(of, best, value, 0, pairs)) if gain > DROP else (freedom, np.inf)
+    estimate = Estimate(freedom, float(low), float(high), n, float(n))
+    normal_share = gaussian_share(freedom)
     why = None
     if shares.drift + shares.constant > normal_share:
         why = f"what lasts is more than the share of {normal_share:.2g} of the variance that it could have"
@@ -444,9 +443,8 @@ def gaussian_share(nu: float) -> float:
 
 
 def weigh_covariances(moments: Moments, error_m: Float, bin_ix: Int, nu: float) -> Moments:
-    """Covariances of Student's t by its likelihood: far errors count for less, ν/(ν − 2) makes up for it.
-
-    Their degrees of freedom are those of a Gaussian's over (ν + 4)/(ν + 2) · (1 + 1/ν).
+    """Covariances of Student's t by its likelihood: far errors count for less, ν/(ν − 2) makes up for it. Their degrees
+    of freedom are those of a Gaussian's over (ν + 4)/(ν + 2) · (1 + 1/ν).
     """
     scatter = moments.covariance_m2 * (nu - 2) / nu
     for _ in range(30):
@@ -461,15 +459,15 @@ def weigh_covariances(moments: Moments, error_m: Float, bin_ix: Int, nu: float) 
 
 
 def _widen_by_tails(error_bin: ErrorBin, nu: Estimate) -> ErrorBin:
-    """The variances' limits with those of ν: a variance is ν/(ν − 2) times what the bulk of the errors tells."""
-    factor, least, most = (
+    """The bin with variances' limits widened by those of ν: a variance is ν/(ν − 2) times that of the bulk."""
+    factor, least_factor, most_factor = (
         value / (value - 2) if value > 2.0001 else np.inf for value in (nu.value, min(nu.high, 1e6), nu.low)
     )
 
     def widen(estimate: Estimate) -> Estimate:
-        if not np.isfinite(most):
-            return replace(estimate, low=estimate.low * least / factor, high=np.inf)
-        return replace(estimate, low=estimate.low * least / factor, high=estimate.high * most / factor)
+        if not np.isfinite(most_factor):
+            return replace(estimate, low=estimate.low * least_factor / factor, high=np.inf)
+        return replace(estimate, low=estimate.low * least_factor / factor, high=estimate.high * most_factor / factor)
 
     xx, xy, yy = error_bin.covariance_m2
     return replace(error_bin, covariance_m2=(widen(xx), xy, widen(yy)))

@@ -104,23 +104,23 @@ def maximise_likelihood(
 
 
 def _climb(logp: LogLikelihood, point: Float, low: Float, high: Float) -> tuple[Float, float]:
-    """The maximum within bounds that damped Newton steps from a point reach, and its log-likelihood."""
+    """The maximum within bounds (x, log-likelihood) that damped Newton steps reach from `point`."""
     value, damping = logp(point), 1e-3
     for _ in range(60 if len(point) else 0):
         slope, curvature = _differentiate(logp, point, value, low, high)
-        free = ~(((point <= low) & (slope < 0)) | ((point >= high) & (slope > 0)))
-        slope = np.where(free, slope, 0.0)
-        curvature *= np.outer(free, free)
-        size, axes = np.linalg.eigh(curvature)
-        along = axes.T @ slope
+        is_free = ~(((point <= low) & (slope < 0)) | ((point >= high) & (slope > 0)))
+        slope = np.where(is_free, slope, 0.0)
+        curvature *= np.outer(is_free, is_free)
+        curvatures, axes = np.linalg.eigh(curvature)
+        slope_along = axes.T @ slope
         while True:
-            step = axes @ (along / (np.abs(size) * (1 + damping) + damping + 1e-9))
+            step = axes @ (slope_along / (np.abs(curvatures) * (1 + damping) + damping + 1e-9))
             step *= min(1.0, _FAR / max(np.abs(step).max(), 1e-12))
-            ahead = np.clip(point + step, low, high)
-            if slope @ (ahead - point) < _GAIN:
+            next_point = np.clip(point + step, low, high)
+            if slope @ (next_point - point) < _GAIN:
                 return point, value
-            if (better := logp(ahead)) > value:
-                point, value, damping = ahead, better, damping / 8
+            if (next_value := logp(next_point)) > value:
+                point, value, damping = next_point, next_value, damping / 8
                 break
             damping *= 10
     return point, value
@@ -147,6 +147,7 @@ def profile_limits(logp: LogLikelihood, best: Float, value: float, k: int, bound
     low, high = ([(1 - a) * one + a * two for one, two in other_bounds] for a in (0.3, 0.7))
 
     def limit(towards: float) -> float:
+        """The value of parameter k, below or above the best, where the profile likelihood has fallen by `DROP`."""
         starts = [best[other_ix], np.clip(best[other_ix], low, high)]
 
         def fall(point: float) -> float:
@@ -165,14 +166,14 @@ def profile_limits(logp: LogLikelihood, best: Float, value: float, k: int, bound
             if outer == end:
                 return end
             inner, step = outer, 2 * step
-        before = fall(inner) if inner != best[k] else -DROP
+        inner_gap = fall(inner) if inner != best[k] else -DROP
         for _ in range(6):  # the profile is about a parabola: secants of its root meet fast
-            near, far = np.sqrt(max(before + DROP, 0.0)), np.sqrt(over + DROP)
+            near, far = np.sqrt(max(inner_gap + DROP, 0.0)), np.sqrt(over + DROP)
             point = inner + (outer - inner) * np.clip((np.sqrt(DROP) - near) / (far - near), 0.02, 0.98)
             gap = fall(point)
             if abs(gap) < 0.02:
                 return float(point)
-            inner, before, outer, over = (point, gap, outer, over) if gap < 0 else (inner, before, point, gap)
+            inner, inner_gap, outer, over = (point, gap, outer, over) if gap < 0 else (inner, inner_gap, point, gap)
         return float(inner)
 
     return limit(-1.0), limit(1.0)

@@ -20,7 +20,6 @@ from copem_replay.extras.fitting.rows import FitLists, FitRows, OtherEntries
 @kernel
 def log_classes(shares: Float, listed: Int, decay: Float, new: Bool, share: float) -> float:
     """Logarithm of the probability of listed classes (n,), by probabilities (n, C) that are the same within a series.
-
     With probability `share` a list uses the held uniform; the filter has the probability that it lies in each cell.
     """
     n, C = shares.shape
@@ -41,7 +40,6 @@ def log_classes(shares: Float, listed: Int, decay: Float, new: Bool, share: floa
 @kernel
 def link_entries(follows: Int, begin: Int, x_m: Float, y_m: Float, ids: Int, gate_m: float) -> Int:
     """(E,) the entry of the list before that each continues, −1: none. First by id, then the nearest within a gate.
-
     Entries lie list by list, those of list k from `begin[k]` on. `follows (L,)`: the list before each, −1: none.
     """
     out = np.full(len(x_m), -1)
@@ -73,17 +71,15 @@ def link_entries(follows: Int, begin: Int, x_m: Float, y_m: Float, ids: Int, gat
 
 
 def garwood_interval(count: float) -> tuple[float, float]:
-    """The 95 % interval of a Poisson mean, of which `count` were seen; also of an effective count.
-
-    Source: F. Garwood, "Fiducial limits for the Poisson distribution", Biometrika 28 (1936) 437–442.
+    """The 95 % interval of a Poisson mean, of which `count` were seen; also of an effective count. Source: F. Garwood,
+    "Fiducial limits for the Poisson distribution", Biometrika 28 (1936) 437–442.
     """
     return (float(chi2.ppf(0.025, 2 * count) / 2) if count else 0.0), float(chi2.ppf(0.975, 2 * count + 2) / 2)
 
 
 def estimate_duration(stayed_s: Float, ended_s: Float, event: str) -> Estimate:
-    """The mean duration τ (s) by maximum likelihood, of gaps over which it stayed and gaps in which it ended.
-
-    The interval is that of the number of ends. Without an end only a lower limit can be told.
+    """The mean duration τ (s) by maximum likelihood, of gaps over which it stayed and gaps in which it ended. The
+    interval is that of the number of ends. Without an end only a lower limit can be told.
     """
     from scipy.optimize import brentq
 
@@ -175,21 +171,23 @@ def fit_ghosts(rows: FitRows, lists: FitLists, other: OtherEntries) -> GhostsFit
 def _fit_sorts(
     rows: FitRows, L: int, entries: OtherEntries, first: Int, lasts_s: Estimate, phi: float
 ) -> tuple[GhostSort, ...]:
-    """The sorts: a field, and `beside` objects where more are near them than by chance. `first`: where ghosts begin."""
+    """The sorts of ghosts: in a field, and `beside` objects if more are near them than by chance. `L`: lists; `first`:
+    rows where ghosts begin; `phi`: correlation of their number from list to list.
+    """
     from scipy.stats import binom
 
-    near = entries.nearest_m[first] <= _NEAR_M
+    is_near = entries.nearest_m[first] <= _NEAR_M
     field, area_m2 = _fit_field(entries, first)
     in_reach = len(rows.log) / L
     chance = min(in_reach * np.pi * _NEAR_M**2 / area_m2, 1.0)
     excess = 0.0
-    if binom.sf(int(near.sum()) - 1, len(first), chance) < _SURE:
-        excess = max((near.mean() - chance) / max(1 - chance, 1e-9), 0.0)
-    worth = L * (1 - phi) / (1 + phi)
+    if binom.sf(int(is_near.sum()) - 1, len(first), chance) < _SURE:
+        excess = max((is_near.mean() - chance) / max(1 - chance, 1e-9), 0.0)
+    effective_lists = L * (1 - phi) / (1 + phi)
 
     def in_list(share: float, per: float) -> Estimate:
         mean = len(entries.list) * share / L
-        count = mean * worth
+        count = mean * effective_lists
         low, high = garwood_interval(count)
         return Estimate(mean / per, mean * low / max(count, 1e-9) / per, mean * high / max(count, 1e-9) / per,
                         round(len(entries.list) * share), count)  # fmt: skip
@@ -197,34 +195,34 @@ def _fit_sorts(
     classes = _count_classes(entries.class_ix[first])
     out = [GhostSort(in_list(1 - excess, 1.0), lasts_s, field, classes)] if excess < 0.95 else []
     if excess > 0:
-        count = np.bincount(entries.nearest_class_ix[first[near]], minlength=len(CLASSES))
-        kinds = np.flatnonzero(count >= max(0.1 * count.sum(), 1))
-        of_objects = max(int(np.isin(rows.view.class_ix, kinds).sum()), 1)
+        count = np.bincount(entries.nearest_class_ix[first[is_near]], minlength=len(CLASSES))
+        near_classes = np.flatnonzero(count >= max(0.1 * count.sum(), 1))
+        of_objects = max(int(np.isin(rows.view.class_ix, near_classes).sum()), 1)
         sides_m = np.median(np.concatenate([rows.view.length_m, rows.view.width_m])) / 2
-        within_m = max(float(np.quantile(entries.nearest_m[first[near]], 0.9)) - float(sides_m), 0.5)
-        where = {"kind": "beside", "classes": [CLASSES[k] for k in kinds], "within_m": round(within_m, 1)}
+        within_m = max(float(np.quantile(entries.nearest_m[first[is_near]], 0.9)) - float(sides_m), 0.5)
+        where = {"kind": "beside", "classes": [CLASSES[k] for k in near_classes], "within_m": round(within_m, 1)}
         out.append(
-            GhostSort(in_list(excess, of_objects / L), lasts_s, where, _count_classes(entries.class_ix[first[near]]))
+            GhostSort(in_list(excess, of_objects / L), lasts_s, where, _count_classes(entries.class_ix[first[is_near]]))
         )
     return tuple(out)
 
 
 def _fit_field(entries: OtherEntries, first: Int) -> tuple[dict[str, Any], float]:
-    """Where ghosts begin: an annulus, or a sector of it where a good part of the circle is empty; and its area (m²)."""
+    """Where ghosts begin, an annulus or a sector of it, as keys of the experiment file, and its area (m²)."""
     range_m = entries.range_m[first]
     n = len(first)
     far_m, near_m = float(range_m.max()) * (1 + 1 / (2 * n)), max(float(range_m.min()) * (1 - 1 / n), 0.0)
     azimuth = np.sort(np.mod(entries.azimuth_rad[first], 2 * np.pi))
     gaps = np.diff(azimuth, append=azimuth[0] + 2 * np.pi)
-    widest, usual = int(np.argmax(gaps)), 2 * np.pi / n
+    widest_gap, usual_gap = int(np.argmax(gaps)), 2 * np.pi / n
     where: dict[str, Any] = {"kind": "field", "range_m": [round(near_m, 1), round(far_m, 1)]}
-    turn = 2 * np.pi
-    if n >= 8 and gaps[widest] > max((np.log(n) + 7) * usual, np.pi / 6):
-        aside = (turn - gaps[widest]) / n / 2
-        start, turn = azimuth[(widest + 1) % n] - aside, turn - gaps[widest] + 2 * aside
-        wrapped = [(np.rad2deg(angle) + 180) % 360 - 180 for angle in (start, start + turn)]
+    angle_rad = 2 * np.pi
+    if n >= 8 and gaps[widest_gap] > max((np.log(n) + 7) * usual_gap, np.pi / 6):
+        margin_rad = (angle_rad - gaps[widest_gap]) / n / 2
+        start, angle_rad = azimuth[(widest_gap + 1) % n] - margin_rad, angle_rad - gaps[widest_gap] + 2 * margin_rad
+        wrapped = [(np.rad2deg(angle) + 180) % 360 - 180 for angle in (start, start + angle_rad)]
         where["azimuth_deg"] = [round(float(angle), 1) for angle in wrapped]
-    return where, turn / 2 * (far_m**2 - near_m**2)
+    return where, angle_rad / 2 * (far_m**2 - near_m**2)
 
 
 def _count_classes(class_ix: Int) -> dict[str, float]:

@@ -337,7 +337,7 @@ def _invert_period(period_s: Estimate) -> Estimate:
 
 
 def _note_data(gathered: Gathered, truth: Truth, how: FitOptions) -> list[str]:
-    """Notes on matches, truth and folds."""
+    """Notes for the user on matches near the gate, on entries about no object, and on passes to hold out."""
     lists, other = gathered.lists, gathered.other
     notes = [f"{gathered.beyond:.1%} of the matches are farther apart than 0.8 of the gate", *gathered.notes]
     if truth == "partial":
@@ -373,7 +373,7 @@ def build_pem(fit: Fit) -> Tree:
 
 
 def _list_bins(fit: Fit) -> Iterator[tuple[Tree, ErrorBin]]:
-    """The bins of the errors, and where each holds: together in all of the reach."""
+    """The bins of the errors, each with the condition where it holds; the outer ones go to the ends of the reach."""
     low_m, high_m = fit.gathered.reach.range_m
     bins = fit.parts.errors.bins
     nearest = min(error_bin.where.range_m[0] for error_bin in bins)
@@ -387,6 +387,7 @@ def _list_bins(fit: Fit) -> Iterator[tuple[Tree, ErrorBin]]:
 
 
 def _build_couple(fit: Fit, detection: DetectionCouple, of_bin: tuple[Tree, ErrorBin]) -> Tree:
+    """One couple as keys of the experiment file: where it holds, detection, errors of a bin, existence."""
     where, errors = of_bin
     reach = fit.gathered.reach
     comment = "within reach: nothing is claimed beyond the last 5 m, and the last 5°, with five matched entries"
@@ -465,9 +466,8 @@ def _complete_recorded(recorded: Tree, stated: Tree) -> Tree:
 
 
 def _build_log_entry(entry: Any, fit: Fit, log: str, names: tuple[str, str], stated: Tree, recorded: Tree) -> Any:
-    """An entry of `logs` with the settings of the unit for the fitted and the recorded one, and with its own delay.
-
-    `names`: of both; `recorded`: the keys of the lists that the experiment has for all logs.
+    """An entry of `logs` with the settings of both units, the fitted and the recorded one, and with its own delay.
+    `names`: of both; `stated`, `recorded`: keys of the lists, as fitted and as the experiment has them for all logs.
     """
     settings = dict(entry) if isinstance(entry, dict) else {"file": entry}
     units, own_s = dict(settings.get("units") or {}), fit.delay.of_log.get(log)

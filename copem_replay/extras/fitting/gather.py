@@ -172,20 +172,20 @@ def _find_full_bins(bin_ix: Int, listed: Bool) -> Int:
 
 
 def _find_sector(azimuth_deg: Float, listed: Bool) -> tuple[float, float] | None:
-    """All around but the widest gap between bins with enough rows; None: no gap, or no bin has enough."""
+    """First and last azimuth (deg) of all bins but the widest gap; None: no gap, or no full bin."""
     count = round(360 / AZIMUTH_BIN_DEG)
-    full = _find_full_bins(np.floor(np.mod(azimuth_deg, 360.0) / AZIMUTH_BIN_DEG).astype(np.int64) % count, listed)
-    if not len(full):
+    full_bins = _find_full_bins(np.floor(np.mod(azimuth_deg, 360.0) / AZIMUTH_BIN_DEG).astype(np.int64) % count, listed)
+    if not len(full_bins):
         return None
-    gap = np.diff(full, append=full[0] + count) - 1
+    gap = np.diff(full_bins, append=full_bins[0] + count) - 1
     widest = int(gap.argmax())
     if gap[widest] == 0:
         return None
-    first = full[(widest + 1) % len(full)] * AZIMUTH_BIN_DEG
-    last = (full[widest] + 1) * AZIMUTH_BIN_DEG
-    turn = first - 360.0 if first >= 180.0 else first
-    end = last - 360.0 if last > 180.0 else last
-    return float(turn), float(end)
+    sector_first = full_bins[(widest + 1) % len(full_bins)] * AZIMUTH_BIN_DEG
+    sector_last = (full_bins[widest] + 1) * AZIMUTH_BIN_DEG
+    first_deg = sector_first - 360.0 if sector_first >= 180.0 else sector_first
+    last_deg = sector_last - 360.0 if sector_last > 180.0 else sector_last
+    return float(first_deg), float(last_deg)
 
 
 def number_passes(log: Int, object_ix: Int, list_ix: Int) -> Int:
@@ -332,6 +332,7 @@ def _ellipse_m(pieces: Sequence[_MatchedLog]) -> Float:
 
 
 def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m: Float) -> _MatchedLog:
+    """Rows of one log (true objects by list) with their entries, and entries about no object; `gates`: m and s."""
     gate_m, max_gap_s = gates
     lists, scene, L = view.found, view.scene, len(view.captured_s)
     # To a unit the ego is an object like any other.
@@ -340,16 +341,16 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
     )
     object_ix, list_of = assigned.row_object_ix.copy(), view.place_of[assigned.frame_ix]
     is_in_list = list_of >= 0
-    kind = lists.class_probability.argmax(axis=1)
+    entry_class = lists.class_probability.argmax(axis=1)
     entries = np.bincount(list_of[is_in_list], minlength=L)
-    class_ix = kind if (kind != _OTHER).any() else np.full(len(kind), -1)
+    class_ix = entry_class if (entry_class != _OTHER).any() else np.full(len(entry_class), -1)
     fields = {"class_ix": class_ix, "existence": lists.existence, "track_id": lists.track_id}
     R, objects = len(view.row), len(scene.object_ids)
     row_object = view.states.row_object_ix[view.row]
     key = view.list_ix * objects + row_object
-    by_key = np.argsort(key)
+    row_by_key = np.argsort(key)
     matched = np.flatnonzero(is_in_list & (object_ix >= 0) & (object_ix != view.carrier_ix))
-    rows_of_matched = by_key[np.searchsorted(key[by_key], list_of[matched] * objects + object_ix[matched])]
+    rows_of_matched = row_by_key[np.searchsorted(key[row_by_key], list_of[matched] * objects + object_ix[matched])]
     entry = np.full(R, -1)
     entry[rows_of_matched] = matched
     errors = _error_columns(view, lists, entry)
@@ -374,7 +375,7 @@ def _match_log(number: int, view: LogView, gates: tuple[float, float], ellipse_m
 
 
 def _error_columns(view: LogView, lists: RecordedLists, entry: Int) -> dict[str, Any]:
-    """Entry minus truth of rows (R,), NaN where not listed, or where no entry of the log has the field."""
+    """Entry minus truth of rows (R,), by column; NaN: not listed, or no entry of the log has the field."""
     tracks, listed = lists.tracks, entry >= 0
 
     def listed_value(name: str) -> Float:
@@ -390,8 +391,8 @@ def _error_columns(view: LogView, lists: RecordedLists, entry: Int) -> dict[str,
     cos, sin = np.cos(bearing), np.sin(bearing)
     vx, vy = true_value("vx_mps"), true_value("vy_mps")
     speed = np.hypot(vx, vy)
-    towards = [(vx, np.cos(true_value("yaw_rad"))), (vy, np.sin(true_value("yaw_rad")))]
-    ahead_e, ahead_n = (np.where(speed > 0, v / np.maximum(speed, 1e-9), turn) for v, turn in towards)
+    components = [(vx, np.cos(true_value("yaw_rad"))), (vy, np.sin(true_value("yaw_rad")))]
+    ahead_e, ahead_n = (np.where(speed > 0, v / np.maximum(speed, 1e-9), turn) for v, turn in components)
     east_mps, north_mps = (np.where(listed, column[0, entry], np.nan) for column in (tracks.vx_mps, tracks.vy_mps))
     # Messages state no velocity of stationary objects; some units state none at all.
     unstated = (east_mps == 0) & (north_mps == 0) & ~view.scene.moving[view.states.row_object_ix[view.row]]
@@ -409,16 +410,16 @@ def _error_columns(view: LogView, lists: RecordedLists, entry: Int) -> dict[str,
 def _other_columns(
     number: int, view: LogView, other: Int, list_ix: Int, rows: dict[str, Any], fields: dict[str, Any]
 ) -> dict[str, Any]:
-    """Columns (E,) of entries about no true object, with the distance of the nearest true object."""
+    """Columns (E,) of the entries `other`, about no true object: place, class, and the nearest true object."""
     tracks = view.found.tracks
     east, north = tracks.x_m[0, other], tracks.y_m[0, other]
     places = np.stack([rows["x_m"], rows["y_m"], view.list_ix * _APART_M], axis=1)
     entry_places = np.stack([east, north, list_ix * _APART_M], axis=1)
     if len(places) and len(entry_places):
-        nearest_m, nearest = cKDTree(places).query(entry_places)
+        nearest_m, nearest_row = cKDTree(places).query(entry_places)
     else:
-        nearest_m, nearest = np.full(len(other), np.inf), np.zeros(len(other), dtype=np.int64)
-    nearest_class = view.view.class_ix[view.row][nearest] if len(places) else np.full(len(other), -1)
+        nearest_m, nearest_row = np.full(len(other), np.inf), np.zeros(len(other), dtype=np.int64)
+    nearest_class = view.view.class_ix[view.row][nearest_row] if len(places) else np.full(len(other), -1)
     dx, dy = east - view.east_m[list_ix], north - view.north_m[list_ix]
     return {
         "list": list_ix.copy(), "log": np.full(len(other), number), "captured_s": view.captured_s[list_ix],

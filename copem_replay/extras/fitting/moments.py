@@ -224,7 +224,7 @@ def mean_half_width(residuals: Float, new: Bool, phi: float, variance: float) ->
 
 
 def _shrink_covariances(covariance: Float, freedom: Float) -> tuple[Float, Float]:
-    """Covariances (B, 2, 2) shrunk towards the pooled one, and their degrees of freedom (B,)."""
+    """Covariances (B, 2, 2) shrunk towards the pooled one (empirical Bayes), and their degrees of freedom (B,)."""
     from scipy.special import multigammaln
 
     pooled = (covariance * freedom[:, None, None]).sum(axis=0) / freedom.sum() + 1e-9 * np.eye(2)
@@ -234,9 +234,9 @@ def _shrink_covariances(covariance: Float, freedom: Float) -> tuple[Float, Float
 
     def evidence(strength: float) -> float:
         prior = (strength - 3) * pooled
-        both = strength + freedom
-        gammas = multigammaln(both / 2, 2) - multigammaln(strength / 2, 2)
-        dets = strength * np.log(np.linalg.det(prior)) - both * np.log(np.linalg.det(prior + scatter))
+        posterior_strength = strength + freedom
+        gammas = multigammaln(posterior_strength / 2, 2) - multigammaln(strength / 2, 2)
+        dets = strength * np.log(np.linalg.det(prior)) - posterior_strength * np.log(np.linalg.det(prior + scatter))
         return float((gammas + dets / 2).sum())
 
     strength = max(_STRENGTHS, key=evidence)

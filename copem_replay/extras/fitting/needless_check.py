@@ -34,7 +34,7 @@ class NeedlessCheck:
     ghosts: tuple[float | None, ...] = ()
 
     def line(self) -> str:
-        """As a line of the fit's table."""
+        """A line for the table of the fit: needless braking as recorded and as fitted, or why it is not known."""
         if self.why:
             return f"braking for nothing on logs held out: not known: {self.why}"
         parts = [

@@ -90,6 +90,7 @@ def _figure_sections(fit: Fit) -> Iterator[tuple[str, str, Html]]:
 
 
 def _estimates_table(fit: Fit) -> Html:
+    """The table of all fitted numbers with their intervals and how many rows they are from."""
     rows = [
         make_tag(
             "tr",
@@ -112,6 +113,7 @@ def _list_ladders(fit: Fit) -> dict[str, Sequence[Rung]]:
 
 
 def _choice_tables(fit: Fit) -> Html:
+    """Tables of the models that were compared, a table by quantity, with scores and the chosen one."""
     intro = (
         "Each model is scored on passes it was not fitted to; the simplest within one standard error of the best is "
         "written. Where too few passes are there to hold any out, BIC decides."
@@ -297,6 +299,7 @@ def rows_table(fit: Fit, recordings: Sequence[Recording]) -> pd.DataFrame:
 
 
 def _build_rows(gathered: Gathered, logs: Sequence[str], recordings: Sequence[Recording]) -> pd.DataFrame:
+    """The rows that a model is fitted to, as a table: a row by list and true object, with its errors if listed."""
     rows, view = gathered.rows, gathered.rows.view
     scenes = {recording.scene.log: recording.scene for recording in recordings}
     names = [scenes[logs[k]].object_ids[o] for k, o in zip(rows.log.tolist(), rows.object.tolist(), strict=True)]
@@ -357,7 +360,7 @@ def write_fit_places(path: Path, unit: str, logs: tuple[str, ...], rows: FitRows
 
 
 def _send_log(out: RecordingSink, log: str, unit: str, rows: FitRows, lists: FitLists, ix: Int) -> None:
-    """Send what a log has, with rows list by list. `ix`: its lists."""
+    """Send one log to the viewer: listed and missed objects, errors as arrows, and the unit. `ix`: its lists."""
     import rerun as rr
 
     elapsed_ns = to_nanoseconds(lists.captured_s[ix])
@@ -385,7 +388,7 @@ def _flat_positions(east_m: Float, north_m: Float) -> np.ndarray:
 
 
 def _fit_blueprint(logs: tuple[str, ...], rows: FitRows) -> rrb.Blueprint:
-    """Two views from above: whole logs, and the current list."""
+    """The layout of the viewer: two views from above, one of whole logs and one of the current list."""
     import rerun.blueprint as rrb
 
     low, high = rows.state_m.min(axis=0), rows.state_m.max(axis=0)

@@ -130,7 +130,7 @@ def _estimate_sigma(variance: float, error: float, n: int, blocks: int) -> Estim
 
 
 def _sum_lagged_products(rows: FitRows, lists: FitLists, block: Int, east_m: Float, north_m: Float) -> Float:
-    """(1 + lags, 2, blocks) Σ eᵢ(t)·eⱼ(t + lag) over different objects, and the number of pairs; lag 0 first."""
+    """(1 + lags, 2, blocks) Σ eᵢ(t)·eⱼ(t + lag) over different objects i, j, and the number of pairs; lag 0 first."""
     L, B = len(lists.log), int(block.max()) + 1
     key = rows.object * L + rows.list + rows.log * L * (int(rows.object.max()) + 1)
     order = np.argsort(key)
@@ -140,21 +140,21 @@ def _sum_lagged_products(rows: FitRows, lists: FitLists, block: Int, east_m: Flo
         if lag >= L:
             break
         same_log = lists.log[: L - lag] == lists.log[lag:]
-        product, number = (
+        product, pair_count = (
             np.where(same_log, sum(one[: L - lag] * one[lag:] for one in ones), 0.0) for ones in (total[:2], total[2:])
         )
         position = np.clip(np.searchsorted(key[order], key + lag), 0, len(key) - 1)
-        later = order[position]
-        own_pair = (key[later] == key + lag) & (rows.list + lag < L)
-        own = east_m * east_m[later] + north_m * north_m[later]
-        product -= np.bincount(rows.list[own_pair], own[own_pair], L)[: L - lag]
-        number -= np.bincount(rows.list[own_pair], minlength=L)[: L - lag]
-        out[k] = [np.bincount(block[: L - lag], one, B) for one in (product, number)]
+        later_row = order[position]
+        own_pair = (key[later_row] == key + lag) & (rows.list + lag < L)
+        own_product = east_m * east_m[later_row] + north_m * north_m[later_row]
+        product -= np.bincount(rows.list[own_pair], own_product[own_pair], L)[: L - lag]
+        pair_count -= np.bincount(rows.list[own_pair], minlength=L)[: L - lag]
+        out[k] = [np.bincount(block[: L - lag], one, B) for one in (product, pair_count)]
     return out
 
 
 def _fit_pose_memory(lags: Float, period_s: float, n: int) -> LastingPart | None:
-    """A drift by least squares of the correlations at lags, or a part that always lasts; None: neither is sure."""
+    """The lasting part of the pose error: a drift, or a constant if that is too slow to tell; None: none is sure."""
     from scipy.optimize import least_squares
 
     B = lags.shape[2]
@@ -243,7 +243,7 @@ def _list_classes(recording: Recording) -> tuple[str, ...]:
 
 
 def _estimate_by_class(logs: Sequence[tuple[Recording, RecordedLists]]) -> dict[str, Estimate]:
-    """By class the delay of entries about its objects: as that of all, against the truth of this class alone."""
+    """By class the delay (s) of entries about its objects, estimated against the truth of this class alone."""
     out = {}
     for kind in sorted({kind for recording, _ in logs for kind in _list_classes(recording)}):
         delays = {}
@@ -286,15 +286,16 @@ def _note_contradiction(delays: Mapping[str, TimeOffset]) -> tuple[str, ...]:
 
 
 def _weigh_delays(offsets: Sequence[TimeOffset]) -> Estimate:
+    """The mean delay (s) of some logs: with enough logs by random effects, else weighted, widened by Birge's ratio."""
     if len(offsets) >= FEWEST_LOGS:
         return _pool_offsets(offsets).mean
     offset_s = np.array([one.offset_s for one in offsets])
     sigma_s = np.array([(one.high_s - one.low_s) / (2 * _Z) for one in offsets])
     weight = 1 / sigma_s**2
     mean_s = float((weight * offset_s).sum() / weight.sum())
-    wider = 1.0  # Birge's ratio
+    birge_ratio = 1.0  # Birge's ratio
     if len(offsets) > 1:
-        wider = max(1.0, float(np.sqrt((weight * (offset_s - mean_s) ** 2).sum() / (len(offsets) - 1))))
-    half_s = float(_Z * wider / np.sqrt(weight.sum()))
+        birge_ratio = max(1.0, float(np.sqrt((weight * (offset_s - mean_s) ** 2).sum() / (len(offsets) - 1))))
+    half_s = float(_Z * birge_ratio / np.sqrt(weight.sum()))
     n = sum(one.entries for one in offsets)
     return Estimate(mean_s, mean_s - half_s, mean_s + half_s, n, float("nan"))

@@ -139,7 +139,7 @@ def simulate_lists(
 
 
 def _split_draws(rows: FitRows, lists: FitLists, runs: Int, seed: int) -> Iterator[tuple[Int, UnitDraws]]:
-    """The rows of each log, and their random draws."""
+    """Log by log, the indices of its rows and the random draws for them."""
     bounds = np.searchsorted(lists.log, np.arange(int(lists.log.max()) + 2))
     for log, (first, after) in enumerate(pairwise(bounds.tolist())):
         rows_of_log = np.flatnonzero(rows.log == log)
@@ -154,7 +154,7 @@ def _split_draws(rows: FitRows, lists: FitLists, runs: Int, seed: int) -> Iterat
 
 
 def _draw_pose(draws: UnitDraws, placed: PoseError) -> tuple[Float, Float, Float]:
-    """East, north (m) and turn (rad), (S, K) each: one draw for all rows of a list, as in a replay."""
+    """East, north (m) and turn (rad) of the pose error, (S, K) each: one draw for all rows of a list."""
     frames, of_row = np.unique(draws.lists.frame_ix, return_inverse=True)
     stamp_ns = draws.lists.stamp_ns[frames]
     zeros = np.zeros(len(frames), dtype=np.int64)
@@ -185,23 +185,24 @@ def compute_statistics(listed: Bool, along_m: Float, across_m: Float, rows: FitR
 
 @kernel
 def _fill_statistics(listed: Bool, along: Float, across: Float, at_s: Float, start: Int, out: Float) -> None:
+    """Fills `out (6, S, passes)`: first hit (s), most misses in a row, share, RMSE (m), correlation, mean gap (s)."""
     for s in range(listed.shape[0]):
         for k in range(len(start) - 1):
             a, b = start[k], start[k + 1]
             first, last = np.inf, -1
-            run = longest = hits = n_errors = gaps = pairs = 0
+            miss_run = longest = hits = n_errors = gaps = pairs = 0
             gap_s = squares = east = north = product = 0.0
             for i in range(a, b):
                 if not listed[s, i]:
-                    run += 1
-                    longest = max(longest, run)
+                    miss_run += 1
+                    longest = max(longest, miss_run)
                     continue
                 if hits == 0:
                     first = at_s[i] - at_s[a]
-                elif run > 0:
+                elif miss_run > 0:
                     gaps += 1
                     gap_s += at_s[i] - at_s[last]
-                run, last, hits = 0, i, hits + 1
+                miss_run, last, hits = 0, i, hits + 1
                 if np.isfinite(along[s, i]):  # entries beside another object have no error
                     n_errors += 1
                     squares += along[s, i] ** 2 + across[s, i] ** 2
@@ -290,7 +291,7 @@ def compare_totals(totals: Float, passes: int) -> tuple[StatisticCheck, ...]:
 
 
 def _rank_values(values: Float, name: str, passes: Int, seed: int) -> Float:
-    """(S + 1, passes) the rank of each value among all of its pass, 0 … 1, at random among equal ones."""
+    """(S + 1, passes) the rank of each value in its pass, 0 … 1, at random among equal ones; NaN: no value."""
     zero = np.zeros(len(passes), dtype=np.int64)
     key = RandomKey(("",), zero, object_words([str(k) for k in passes.tolist()]), zero)
     chance = CounterRng(seed, "replay check").uniform(name, key, np.arange(len(values)))

@@ -127,7 +127,7 @@ class ExistenceFit:
     untold: str | None = None
 
     def keys(self) -> dict[str, Any]:
-        """A couple's `existence`; empty where nothing is fitted. Ghosts without a fit claim what objects do."""
+        """The key `existence` of a couple; empty: nothing is fitted. Ghosts without a fit claim what objects do."""
         if self.number is not None:
             return {"existence": CommentedValue(round(self.number.value, 4), "the same of every entry")}
         if self.real is None:
@@ -189,21 +189,21 @@ def beta_shapes(values: Float, cluster: Int) -> tuple[Estimate, Estimate]:
 def _correct_for_ghosts(
     claimed: Float, shapes: tuple[Estimate, Estimate], ghost: tuple[float, float]
 ) -> tuple[Estimate, Estimate]:
-    """The shapes (a, b) where some matched entries are ghosts near an object: the likeliest mixture of both."""
+    """The shapes (a, b) of Beta where some matched entries are ghosts near an object, from the likeliest mixture."""
     values = np.clip(claimed, 1e-6, 1 - 1e-6)
-    false = beta.pdf(values, *ghost)
+    ghost_density = beta.pdf(values, *ghost)
 
     def of(x: Float) -> float:
         share = float(expit(x[2]))
-        return float(np.log((1 - share) * beta.pdf(values, *np.exp(x[:2])) + share * false + 1e-300).sum())
+        return float(np.log((1 - share) * beta.pdf(values, *np.exp(x[:2])) + share * ghost_density + 1e-300).sum())
 
     start = [float(np.log(one.value)) for one in shapes]
     limits = (float(np.log(_SHAPES[0])), float(np.log(_SHAPES[1])))
     best, _ = maximise_likelihood(of, [(*start, -6.0), (*start, -3.0)], (limits, limits, (-9.0, 0.0)))
-    moved = np.exp(best[:2]) / [one.value for one in shapes]
+    factors = np.exp(best[:2]) / [one.value for one in shapes]
     one, two = (
         replace(old, value=old.value * by, low=old.low * by, high=old.high * by)
-        for old, by in zip(shapes, moved.tolist(), strict=True)
+        for old, by in zip(shapes, factors.tolist(), strict=True)
     )
     return one, two
 

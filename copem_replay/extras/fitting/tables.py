@@ -121,7 +121,7 @@ def monotone_tables(value: Float, weight: Float, shape: Int) -> Float:
 
 @callee
 def _fit_ascending(value: Float, weight: Float) -> Float:
-    """The nearest ascending values in weighted squares: neighbours that are out of order are pooled."""
+    """The ascending values nearest to `value` in weighted squares: neighbours out of order are pooled (PAVA)."""
     n = len(value)
     mean, mass, size = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
     top = 0
@@ -134,10 +134,10 @@ def _fit_ascending(value: Float, weight: Float) -> Float:
             mass[top - 2], size[top - 2] = total, size[top - 2] + size[top - 1]
             top -= 1
     out = np.empty(n)
-    at = 0
+    position = 0
     for k in range(top):
-        out[at : at + size[k]] = mean[k]
-        at += size[k]
+        out[position : position + size[k]] = mean[k]
+        position += size[k]
     return out
 
 
@@ -178,9 +178,8 @@ def fit_table(entries: PooledRows, times: Float, worth: float, *, monotone: bool
 def _shrink_table(
     placed: NodeWeights, hit: Bool, count: Float, parent: Float, worth: float, monotone: bool
 ) -> tuple[Float, float]:
-    """Probabilities shrunk towards `parent (K,)`, and the strength of greatest likelihood, in effective rows.
-
-    The likelihood of a strength is Laplace's approximation, all probabilities integrated out in their log-odds.
+    """Probabilities (K,) shrunk towards `parent (K,)`, and the likeliest strength of that, in effective rows. The
+    likelihood of a strength is Laplace's approximation, all probabilities integrated out in their log-odds.
     """
     shape, theta, best = np.array(placed.shape), parent, (-np.inf, parent, 0.0)
     for strength in STRENGTHS:

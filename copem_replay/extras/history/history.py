@@ -157,28 +157,29 @@ def find_turns(verdicts: Sequence[Verdict | None]) -> list[tuple[int, str, str]]
 
 
 def _criteria_table(folders: Sequence[JudgedFolder], rows: dict[_Key, list[Verdict | None]]) -> Html:
+    """A row for each criterion, configuration and group, with its verdicts over the folders."""
     lines = []
     for verdicts in rows.values():
-        last = next(one for one in reversed(verdicts) if one is not None)
+        newest_verdict = next(one for one in reversed(verdicts) if one is not None)
         turns = find_turns(verdicts)
         first_turn = [f"{after} at ", folders[turns[0][0]].title] if (after := turns[0][2] if turns else "") else ["–"]
         strip = make_tag("span", *map(verdict_mark, verdicts), class_="strip")
         lines.append(
             make_tag(
                 "tr",
-                make_tag("th", last.name, scope="row"),
-                make_tag("td", allow_breaks(last.configuration), class_="text"),
-                make_tag("td", allow_breaks(last.asked), class_="text"),
+                make_tag("th", newest_verdict.name, scope="row"),
+                make_tag("td", allow_breaks(newest_verdict.configuration), class_="text"),
+                make_tag("td", allow_breaks(newest_verdict.asked), class_="text"),
                 make_tag("td", strip, class_="text"),
                 make_tag("td", draw_strip(verdicts), class_="text"),
-                make_tag("td", last.found, " ", make_tag("span", last.limits, class_="interval")),
+                make_tag("td", newest_verdict.found, " ", make_tag("span", newest_verdict.limits, class_="interval")),
                 make_tag("td", *first_turn, class_="text"),
             )
         )
     head = ["criterion", "configuration", "bound", "verdicts", "figure", "newest", "first turned"]
     key = ", ".join(f"{sign} {word}" for word, sign in VERDICT_SIGNS.items())
-    says = f"{key}; empty: not judged. The line is the bound, bars are the intervals, an open ring has none."
-    return join_html([make_table(head, lines, id_="strips"), make_tag("p", says, class_="below")])
+    legend = f"{key}; empty: not judged. The line is the bound, bars are the intervals, an open ring has none."
+    return join_html([make_table(head, lines, id_="strips"), make_tag("p", legend, class_="below")])
 
 
 _STEP_PX, _HEIGHT_PX, _EDGE_PX = 22.0, 56.0, 6.0
@@ -218,6 +219,7 @@ def draw_strip(verdicts: Sequence[Verdict | None]) -> Html:
 
 
 def _folders_table(folders: Sequence[JudgedFolder]) -> Html:
+    """A row for each folder: whether it passes, counts of verdicts, runs, logs and version."""
     lines = []
     for k, folder in enumerate(folders):
         provenance = folder.results.provenance
@@ -234,15 +236,15 @@ def _folders_table(folders: Sequence[JudgedFolder]) -> Html:
             )
         )
     head = ["", "folder", "", *VERDICT_SIGNS, "runs", "logs", "version"]
-    said = "A name leads to the report where the folder has one (`copem-replay report FOLDER`)."
-    return join_html([make_table(head, lines, id_="all-folders"), make_tag("p", said, class_="below")])
+    note = "A name leads to the report where the folder has one (`copem-replay report FOLDER`)."
+    return join_html([make_table(head, lines, id_="all-folders"), make_tag("p", note, class_="below")])
 
 
 _FIGURES = ("ttd_rmst_s", "ttd_p95_s", "detected_share", "pass_share", SHARE)
 
 
 def _summaries_table(folders: Sequence[JudgedFolder]) -> Html:
-    """Figures of the summary by folder, of the configurations that any of them has."""
+    """Figures of the summary, a table each: rows are configurations that any folder has, columns folders."""
     tables = [folder.results.summary.set_index("configuration") for folder in folders]
     names = list(dict.fromkeys(str(name) for table in tables for name in table.index))
     parts = []
@@ -272,7 +274,7 @@ def _summary_value(table: pd.DataFrame, name: str, figure: str) -> str:
 
 
 def _side_by_side(folders: Sequence[JudgedFolder], turned: dict[_Key, list[tuple[int, str, str]]]) -> Html:
-    """Differences of the newest folder to the one before it, and of each at which a verdict turned."""
+    """Differences of the newest folder to the one before it, and of each folder at which a verdict turned."""
     numbers = sorted({k for turns in turned.values() for k, _, _ in turns} | {len(folders) - 1} - {0}, reverse=True)
     if not numbers:
         return make_tag("p", "One folder: nothing to hold it against.")
@@ -286,6 +288,7 @@ def _side_by_side(folders: Sequence[JudgedFolder], turned: dict[_Key, list[tuple
 
 
 def _difference_table(new: JudgedFolder, old: JudgedFolder) -> Html:
+    """Differences of a folder to the one before it, a row by configuration; or a sentence on why there are none."""
     try:
         rows = list(_difference_rows(new.results, old.results))
     except InputError as error:

@@ -127,7 +127,7 @@ def build_layout(replay: Path, compare: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def _knowledge_panels(contents: ReplayContents, shown: Sequence[str], number: int) -> dict[str, Any]:
-    """The panels of one object: lanes (when it is known), and curves (the age of its entries), by configuration."""
+    """By id the panels of object `number`: lanes (when it is known), and curves (age of its entries, s)."""
     ident = contents.objects[number]
     objects = {
         name: f"{quote_topic(f'{PREFIX}{name}/status')}.objects[:]{{id=={_quote_value(ident)}}}" for name in shown
@@ -165,12 +165,12 @@ def _title_settings(title: str) -> dict[str, str]:
 
 
 def _scene_panel(configurations: Sequence[str], contents: ReplayContents) -> dict[str, Any]:
-    """A 3D panel of some configurations over the truth, whose camera follows the ego."""
+    """The settings of a 3D panel of some configurations over the truth, whose camera follows the ego."""
     camera = {**EYE, "distance": DISTANCE_M, "target": [0, 0, 0], "targetOffset": [0, 0, 0],
               "targetOrientation": [0, 0, 0, 1]}  # fmt: skip
     shown = {f"{PREFIX}{name}/{kind}" for name in configurations for kind in ("scene", "uncertainty")}
     every = [f"{PREFIX}{name}/{kind}" for name in contents.configurations for kind in ("scene", "uncertainty")]
-    drawn = {topic: {"visible": topic in shown} for topic in every}
+    topic_settings = {topic: {"visible": topic in shown} for topic in every}
     truth = {topic: {"visible": True} for topic in TRUTH_TOPICS[:2]} if contents.truth else {}
     grid = {"visible": True, "frameLocked": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid",
             "size": 200, "divisions": 20, "lineWidth": 1, "color": "#55555588"}  # fmt: skip
@@ -179,7 +179,7 @@ def _scene_panel(configurations: Sequence[str], contents: ReplayContents) -> dic
         "cameraState": camera,
         **({"followTf": contents.follow, "followMode": "follow-position"} if contents.follow else {}),
         "scene": {"syncCamera": True, "transforms": {"visible": False}},
-        "topics": {**truth, **drawn},
+        "topics": {**truth, **topic_settings},
         "transforms": {},
         "layers": {"grid": grid},
     }

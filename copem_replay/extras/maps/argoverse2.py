@@ -50,7 +50,7 @@ def _items(parts: Mapping[str, Any], name: str, path: Path) -> list[tuple[str, d
 
 
 def _points(item: Mapping[str, Any], name: str, where: str) -> Float:
-    """Points (K, 3), two at least. Raises InputError."""
+    """Points (K, 3) of the key `name` of an item, two at least. Raises InputError."""
     points = item.get(name)
     if not isinstance(points, list) or len(points) < 2:
         raise InputError(f"{where}: {name}: expected two points or more, found {quote_value(points)}")

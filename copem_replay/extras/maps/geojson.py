@@ -40,7 +40,7 @@ def _find_licence(content: dict[str, Any]) -> str:
 
 
 def _find_shapes(feature: object, where: str, k: int) -> Iterator[Shape]:
-    """Shapes of a feature; none where it has no lines or areas. Raises InputError."""
+    """The shape of feature number k; none where it has no lines or areas. Raises InputError."""
     if not isinstance(feature, dict):
         raise InputError(f"{where}: expected a feature, found {quote_value(feature)}")
     geometry, tags = feature.get("geometry"), _find_tags(feature, where)
@@ -49,8 +49,8 @@ def _find_shapes(feature: object, where: str, k: int) -> Iterator[Shape]:
     depth = _DEPTH[geometry["type"]]
     lists = _check_positions(geometry.get("coordinates"), depth, where)
     is_line = geometry["type"].endswith("LineString")
-    made = _make_geometry(lists if geometry["type"].startswith("Multi") else [lists], is_line, where)
-    yield Shape(str(feature.get("id", tags.get("@id", f"feature {k}"))), made, tags)
+    shape_geometry = _make_geometry(lists if geometry["type"].startswith("Multi") else [lists], is_line, where)
+    yield Shape(str(feature.get("id", tags.get("@id", f"feature {k}"))), shape_geometry, tags)
 
 
 def _find_tags(feature: dict[str, Any], where: str) -> Tags:

@@ -147,7 +147,7 @@ def _find_lane(relation: XmlNode, lines: dict[str, Float]) -> Lane | None:
 
 
 def _turn_borders(left: Float, right: Float) -> tuple[Float, Float]:
-    """The borders in one direction, in which the left one is on the left."""
+    """Both borders (K, 3) in one direction, in which the left one is on the left."""
 
     def apart(a: int, b: int) -> float:
         return float(np.hypot(*(left[a, :2] - right[b, :2])))

@@ -63,7 +63,7 @@ class _Reading:
     corners: int = 0
 
     def number(self, node: XmlNode, name: str, default: float | None = None) -> float:
-        """A number of an element. Raises InputError: missing without a default, or out of bounds."""
+        """The number of an attribute. Raises InputError: missing without a `default`, or out of bounds."""
         text = node.attributes.get(name, "")
         if not text.strip() and default is not None:
             return default
@@ -155,7 +155,7 @@ def read_road_line(reading: _Reading, road: XmlNode) -> RoadLine | None:
 
 
 def _read_piece(reading: _Reading, node: XmlNode) -> Piece:
-    """One geometry of a reference line. Raises InputError."""
+    """One `<geometry>` of a reference line. Raises InputError."""
     shape = next((child for child in node.children if child.tag in SHAPES), None)
     if shape is None:
         found = ", ".join(child.tag for child in node.children[:3]) or "nothing"
@@ -191,7 +191,7 @@ class _LaneNode:
 
 
 def _read_lanes(reading: _Reading, road: XmlNode, line: RoadLine, chord_m: float) -> None:
-    """Add the lanes of all sections of a road."""
+    """Add the lanes of all sections of a road; chords of their borders stay within `chord_m`."""
     offset = _read_cubics(reading, _children(road, "lanes", "laneOffset"))
     sections = sorted(
         ((reading.number(node, "s"), node) for node in _children(road, "lanes", "laneSection")),
@@ -247,7 +247,7 @@ def _find_borders(s: Float, offset_m: Float, lanes: list[_LaneNode], sign: int) 
 def _add_lanes(
     reading: _Reading, road: XmlNode, section: int, lanes: list[_LaneNode], borders: Float, *, forward: bool
 ) -> None:
-    """Add lanes between borders (B, K, 3). `forward`: they are driven along the road."""
+    """Add lanes between neighbouring borders (B, K, 3). `forward`: they are driven along the road."""
     junction = road.attributes.get("junction", "-1")
     for lane, inner, outer in zip(lanes, borders, borders[1:], strict=False):
         if np.abs(inner - outer).max() < 0.01:
@@ -263,13 +263,13 @@ def _add_lanes(
 
 
 def _join_junctions(reading: _Reading) -> None:
-    """The areas of junctions: the union of their lanes."""
+    """Add the area of each junction: the union of its lanes."""
     import shapely
 
     for name, outlines in reading.outlines.items():
         polygons = [make_polygon([outline]) for outline in outlines]
-        if crossing := sum(polygon.is_empty for polygon in polygons):
-            reading.counts["lane", "whose outline crosses itself: not in the area of its junction"] += crossing
+        if crossing_count := sum(polygon.is_empty for polygon in polygons):
+            reading.counts["lane", "whose outline crosses itself: not in the area of its junction"] += crossing_count
         joined = shapely.union_all([polygon.buffer(0.05) for polygon in polygons])
         for polygon in shapely.get_parts(joined):
             if polygon.geom_type == "Polygon" and polygon.area > 1.0:
@@ -284,7 +284,7 @@ _Prism = tuple[Float, float, float]
 
 
 def _read_object(reading: _Reading, node: XmlNode, line: RoadLine, road: str) -> None:
-    """Add an object as a solid, or a crosswalk as an area."""
+    """Add an object of a road as a solid, or a crosswalk as an area; flat ones hide nothing."""
     kind, name = node.attributes.get("type", ""), f"road {road} object {node.attributes.get('id', '')}"
     if kind in _HIDES_NOTHING and kind != "crosswalk":
         return
@@ -312,14 +312,14 @@ def _place_object(reading: _Reading, node: XmlNode, line: RoadLine) -> tuple[Flo
 
 
 def _outline_prisms(reading: _Reading, node: XmlNode, line: RoadLine) -> Iterator[_Prism]:
-    """The prisms of an object's outlines, as high as the highest corner."""
+    """The prisms (corners, bottom, top) of an object's outlines, each as high as its highest corner."""
     raised_m = reading.number(node, "zOffset", 0.0)
     for outline in [*_children(node, "outlines", "outline"), *node.all("outline")]:
         if on_road := outline.all("cornerRoad"):
-            s, t, above, height = _columns(reading, on_road, ("s", "t", "dz", "height"))
+            s, t, above_m, height = _columns(reading, on_road, ("s", "t", "dz", "height"))
             points = line.place(s, t)
         else:
-            u, v, above, height = _columns(reading, outline.all("cornerLocal"), ("u", "v", "z", "height"))
+            u, v, above_m, height = _columns(reading, outline.all("cornerLocal"), ("u", "v", "z", "height"))
             base, heading = _place_object(reading, node, line)
             cos, sin = math.cos(heading), math.sin(heading)
             points = np.stack(
@@ -331,8 +331,8 @@ def _outline_prisms(reading: _Reading, node: XmlNode, line: RoadLine) -> Iterato
             continue
         if np.ptp(height) > 1e-6:
             reading.counts["outline", "with corners of several heights: the highest taken"] += 1
-        foot = points[:, 2] + above
-        bottom_m, top_m = float(foot.min()), float((foot + height).max())
+        foot_m = points[:, 2] + above_m
+        bottom_m, top_m = float(foot_m.min()), float((foot_m + height).max())
         if closed:
             yield points[:, :2], bottom_m, top_m
         else:
@@ -351,7 +351,7 @@ def _columns(reading: _Reading, nodes: list[XmlNode], names: tuple[str, ...]) ->
 
 
 def _single_prism(reading: _Reading, node: XmlNode, line: RoadLine) -> list[_Prism]:
-    """The octagon around an object's radius, or the box of its length and width."""
+    """The octagon around an object's radius, or the box of its length and width; empty: it has no size."""
     base, heading = _place_object(reading, node, line)
     length_m, width_m, height_m, radius_m = (
         reading.number(node, name, 0.0) for name in ("length", "width", "height", "radius")

@@ -144,12 +144,12 @@ class RoadLine:
     tilt: Cubics  # superelevation, rad
 
     def follow(self, s: Float) -> tuple[Float, Float, Float]:
-        """x, y and heading (K,) of the reference line."""
+        """x, y (m) and heading (rad) (K,) of the reference line at s (K,)."""
         starts = np.array([piece.s for piece in self.pieces])
-        which = np.clip(np.searchsorted(starts, s + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
+        piece_ix = np.clip(np.searchsorted(starts, s + _SAME_S_M, side="right") - 1, 0, len(starts) - 1)
         x, y, heading = np.empty((3, *s.shape))
-        for k in np.unique(which):
-            piece, in_piece = self.pieces[k], which == k
+        for k in np.unique(piece_ix):
+            piece, in_piece = self.pieces[k], piece_ix == k
             ahead, left, turn = piece.follow(s[in_piece] - piece.s)
             cos, sin = math.cos(piece.heading_rad), math.sin(piece.heading_rad)
             x[in_piece] = piece.x_m + cos * ahead - sin * left
@@ -206,7 +206,7 @@ class RoadLine:
         return np.concatenate([*cut, places[-1:]])
 
     def _is_far(self, first: Float, last: Float, curves: Callable[[Float], Float], chord_m: float) -> np.ndarray:
-        """Whether a curve leaves its chord, for stretches (K,)."""
+        """(K,) whether any curve is farther than `chord_m` from its chord between `first` and `last` (K,)."""
         a, b = (self.place(s, curves(s)) for s in (first, last))
         along = b - a
         length2 = np.maximum((along**2).sum(axis=-1), 1e-18)

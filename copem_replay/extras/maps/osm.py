@@ -113,7 +113,7 @@ def read_overpass(path: Path, content: dict[str, Any], heights_m: Mapping[str, f
 
 
 def _add_element(data: OsmData, element: dict[str, Any], where: str) -> None:
-    """Add an element of JSON. Raises InputError."""
+    """Add a node, way or multipolygon of Overpass JSON to `data`. Raises InputError."""
     ident, kind = str(element.get("id")), element.get("type")
     tags = _json_tags(element.get("tags", {}), where)
     if kind == "node" and ("lat" in element or "lon" in element):
@@ -122,8 +122,8 @@ def _add_element(data: OsmData, element: dict[str, Any], where: str) -> None:
         if "geometry" in element:
             data.add_geometry(ident, _read_points(element["geometry"], where))
         refs = [str(ref) for ref in _list_of(element, "nodes", where)]
-        known = data.ways.get(ident, (refs, {}))[0] if "geometry" in element else refs
-        data.ways[ident] = (known, tags)
+        known_refs = data.ways.get(ident, (refs, {}))[0] if "geometry" in element else refs
+        data.ways[ident] = (known_refs, tags)
     elif kind == "relation" and tags.get("type") == "multipolygon":
         members = list[Member]()
         for member in _list_of(element, "members", where):
@@ -198,7 +198,7 @@ def _join_rings(lines: list[shapely.LineString]) -> tuple[list[shapely.Geometry]
 
 
 def _find_ways(data: OsmData, counts: Counter[str]) -> Iterator[Shape]:
-    """Closed ways that are areas, and lines of barriers."""
+    """Shapes of ways: areas of closed ones, and lines of barriers."""
     import shapely
 
     for ident, (nodes, tags) in data.ways.items():

@@ -144,7 +144,7 @@ def _metres_per_degree(latitude: float) -> Float:
 
 
 def _make_blocks(shape: Shape, heights_m: Mapping[str, float], counts: Counter[str]) -> Iterator[_Block]:
-    """The prisms of a shape in metres: one for each of its polygons, or for each stretch of a barrier."""
+    """The prisms of a shape (m): one for each of its polygons, or for each stretch of a barrier."""
     import shapely
 
     tags, geometry = shape.tags, shape.geometry
@@ -186,7 +186,7 @@ def _widen_line(line: shapely.Geometry, width_m: float) -> list[shapely.Geometry
 def _find_heights(
     tags: Tags, kind: str, heights_m: Mapping[str, float], counts: Counter[str]
 ) -> tuple[float, float, bool]:
-    """Bottom and top above the ground, and whether it stands on it."""
+    """Bottom and top (m above the ground), and whether it stands on it; what is assumed is counted."""
     level_m = heights_m["level"]
     top_m = parse_metres(tags.get("height")) or parse_metres(tags.get("building:height"))
     if top_m is None and tags.get("height"):
@@ -207,16 +207,16 @@ def _find_heights(
 
 
 def _cut_outlines(blocks: Sequence[_Block], counts: Counter[str]) -> Iterator[_Block]:
-    """Blocks, each outline of a building less its parts (Simple 3D buildings): these say its heights better."""
+    """The blocks; outlines of buildings are cut by their parts (Simple 3D buildings), which say heights better."""
     import shapely
 
     parts = [block.footprint for block in blocks if block.role == "part"]
     tree = shapely.STRtree(parts)
     for block in blocks:
-        inside = (
+        parts_inside = (
             [parts[k] for k in tree.query(block.footprint, predicate="intersects")] if block.role == "outline" else []
         )
-        remainder = block.footprint.difference(shapely.union_all(inside)) if inside else block.footprint
+        remainder = block.footprint.difference(shapely.union_all(parts_inside)) if parts_inside else block.footprint
         if remainder.area > block.footprint.area - 0.5:
             yield block
             continue

@@ -192,7 +192,7 @@ def collect_player_data(study: ReportData, choice: Choice) -> dict[str, Any]:
 
 
 def _find_fused(replayed: ReplayedRun, instants_s: Float) -> dict[str, Rows]:
-    """Rows of each configuration; of each frame those of the last time chunk that has a list by then."""
+    """Rows by configuration; each frame has those of the last time chunk with a list by then."""
     rows_of: dict[str, Rows] = {}
     for chunk in replayed.run_tracks:
         for name, fused_tracks in chunk.items():
@@ -218,7 +218,7 @@ def _find_in_chunk(replayed: ReplayedRun, fused_tracks: FusedTracks, instants_s:
 
 
 def _fit_frames(tracks: dict[str, Rows], instants_s: Float) -> tuple[Grid, dict[str, Rows]]:
-    """The grid of every so many frames, the most that take `MOST_BYTES` in the page, and the rows in them."""
+    """The grid of every so many frames, as many as `MOST_BYTES` allow, and the rows in them."""
     stride = 1
     while True:
         thinned = {name: rows.take(rows.frame % stride == 0) for name, rows in tracks.items()}
@@ -227,9 +227,9 @@ def _fit_frames(tracks: dict[str, Rows], instants_s: Float) -> tuple[Grid, dict[
         stride += 1
     thinned = {name: Rows(rows.frame // stride, *list(vars(rows).values())[1:]) for name, rows in thinned.items()}
     x, y = (np.concatenate([getattr(rows, name) for rows in thinned.values()]) for name in ("x_m", "y_m"))
-    middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2) if len(x) else (0.0, 0.0)
-    farthest = max(np.ptp(x), np.ptp(y)) / 2 if len(x) else 0.0
-    return Grid(instants_s[::stride], middle, max(STEP_M, float(np.ceil(farthest / 327) / 100))), thinned
+    middle_m = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2) if len(x) else (0.0, 0.0)
+    farthest_m = max(np.ptp(x), np.ptp(y)) / 2 if len(x) else 0.0
+    return Grid(instants_s[::stride], middle_m, max(STEP_M, float(np.ceil(farthest_m / 327) / 100))), thinned
 
 
 def _to_text(content: bytes) -> str:
@@ -269,7 +269,7 @@ def _list_lanes(replayed: ReplayedRun, grid: Grid) -> list[list[float]]:
 
 
 def _list_places(replayed: ReplayedRun, grid: Grid) -> list[list[Any]]:
-    """Units with a place of their own: name, x and y, m from the middle."""
+    """Name, x and y (m from the grid's middle) of each unit with a place of its own."""
     poses = replayed.replay.placed.poses
     fixed = (
         name
@@ -318,7 +318,7 @@ _SIGNS = (
 
 
 def _write_player(data: dict[str, Any], says: str) -> Html:
-    """The elements of the player, filled by its script."""
+    """The HTML elements of the player with its data, filled by its script; `says`: the sentence above."""
     names = [one["name"] for one in data["configurations"]]
     panels = [_write_panel(letter, names, k) for letter, k in zip("AB", data["shown"], strict=False)]
     last = str(data["frames"] - 1)
@@ -327,7 +327,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
     )
     head = make_tag("tr", *(make_tag("th", word, scope="col") for word in ("object", *"AB"[: len(panels)], "more")))
     table = make_tag("table", make_tag("caption", "Known after"), make_tag("thead", head), make_tag("tbody"))
-    listed = make_tag("div", table, class_="objects", tabindex="0", role="region", aria_label="Objects")
+    object_list = make_tag("div", table, class_="objects", tabindex="0", role="region", aria_label="Objects")
     controls = make_tag(
         "div", make_tag("button", "play", type="button", class_="play"), slider, make_tag("output", "0.0 s"),
         class_="controls screen",
@@ -338,7 +338,7 @@ def _write_player(data: dict[str, Any], says: str) -> Html:
         [
             make_tag("p", says, " ", make_tag("span", _KEYS, class_="screen")),
             make_tag(
-                "div", make_tag("div", *panels, class_="panels"), controls, _write_signs(), listed,
+                "div", make_tag("div", *panels, class_="panels"), controls, _write_signs(), object_list,
                 make_tag("p", make_tag("code", class_="command"), class_="below"),
                 id_="player", tabindex="0", role="group", aria_label="Player of a run",
             ),

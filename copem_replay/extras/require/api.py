@@ -126,7 +126,7 @@ class Requirement:
 
     @cached_property
     def required(self) -> tuple[float, ...] | None:
-        """The value that is wanted of each key; of two keys the middle of their front. None: none passes."""
+        """The value that is wanted of each key; of two keys the middle of their front. None: no value passes."""
         signs = [1.0 if want == "largest" else -1.0 for want in self.wants]
         if len(self.keys) == 1:
             ordered = self.trials if signs[0] > 0 else self.trials[::-1]
@@ -198,7 +198,7 @@ def require(
 
 
 def _find_criterion(experiment: Experiment, name: str, given: Mapping[str, Any] | AnyPath | None) -> Criterion:
-    """The criterion as it is judged: in closed form where the experiment asks for that, and its metric has one."""
+    """The criterion as it is judged: in closed form if the experiment asks for that and its metric has one."""
     criteria: Mapping[str, Criterion] = experiment.criteria
     if given is not None:
         criteria = read_criteria(given if isinstance(given, Mapping) else Path(given), experiment.as_written())
@@ -213,10 +213,7 @@ def _find_criterion(experiment: Experiment, name: str, given: Mapping[str, Any] 
 
 
 def _reduce(experiment: Experiment, name: str, criterion: Criterion) -> Experiment:
-    """The experiment with the configurations that a criterion is about, and with nothing measured that it does not use.
-
-    It has no other criterion.
-    """
+    """The experiment with this criterion alone, the configurations it is about, and only what it uses measured."""
     names = {*choose_judged(criterion, experiment.configurations), criterion.against}
     measure: dict[str, Any] = {"exact": criterion.metric.endswith("_exact"), "by": ()}
     changes: dict[str, Any] = {"sweep": None, "show": None, "criteria": {name: criterion}}
@@ -244,18 +241,18 @@ def _check_used(study: LoadedStudy, key: FreeKey, names: Sequence[str]) -> None:
 def _search(
     study: LoadedStudy, keys: Sequence[FreeKey], jobs: int | None, cache: PartCache, progress: Progress | None
 ) -> tuple[tuple[Trial, ...], Int]:
-    """The trials of a study with one criterion at values of its keys, ascending, and the levels at all values."""
+    """The trials of a study at values of its keys, ascending, and the levels (how good) at all values."""
     trials: dict[_Index, Trial] = {}
     ready: Sequence[Replay] = ()
 
     def find_level(index: _Index) -> int:
         nonlocal ready
         values = tuple(key.values[k] for key, k in zip(keys, index, strict=True))
-        tried = replace(study, experiment=set_values(study.experiment, keys, values))
+        tried_study = replace(study, experiment=set_values(study.experiment, keys, values))
         if not ready or {key.key[0] for key in keys} & {"pems", "units"}:
-            ready = prepare_study(tried)[0]
-        results = Results(study=replay_study(tried, ready, jobs, None, cache))
-        trials[index] = Trial(values, judge_results(results, tried.experiment.criteria).all)
+            ready = prepare_study(tried_study)[0]
+        results = Results(study=replay_study(tried_study, ready, jobs, None, cache))
+        trials[index] = Trial(values, judge_results(results, tried_study.experiment.criteria).all)
         if progress is not None:
             progress(len(trials), max(_FORESEEN[len(keys)], len(trials) + 1))
         return trials[index].level
@@ -270,19 +267,19 @@ def _search_grid(shape: _Index, level_of: Callable[[_Index], int]) -> Int:
     Blocks whose corners differ are halved, in one dimension a bisection; what is alike at all corners is taken to be
     alike between them.
     """
-    tried: dict[_Index, int] = {}
+    level_by_index: dict[_Index, int] = {}
 
     def find(index: _Index) -> int:
-        if index not in tried:
-            tried[index] = level_of(index)
-        return tried[index]
+        if index not in level_by_index:
+            level_by_index[index] = level_of(index)
+        return level_by_index[index]
 
     places = (np.linspace(0, number - 1, min(_FIRST[len(shape)], number)) for number in shape)
-    first = [sorted(set(map(round, of))) for of in places]
-    for index in product(*first):
+    first_ticks = [sorted(set(map(round, of))) for of in places]
+    for index in product(*first_ticks):
         find(index)
     levels = np.zeros(shape, dtype=int)
-    blocks = list(product(*map(pairwise, first)))
+    blocks = list(product(*map(pairwise, first_ticks)))
     while blocks:
         block = blocks.pop(0)
         corners = list(product(*block))
@@ -300,6 +297,6 @@ def _search_grid(shape: _Index, level_of: Callable[[_Index], int]) -> Int:
         for index in corners:
             along = zip(index, differs, block, strict=True)
             levels[tuple(slice(k, k + 1) if differ else slice(a, b + 1) for k, differ, (a, b) in along)] = find(index)
-    for index, level in tried.items():
+    for index, level in level_by_index.items():
         levels[index] = level
     return levels

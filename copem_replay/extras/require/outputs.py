@@ -64,7 +64,7 @@ def _list_segments(needed: Requirement) -> Iterator[dict[str, str]]:
 
 
 def _list_front(needed: Requirement) -> Iterator[dict[str, str]]:
-    """From which value of the second key on, or up to which, it holds and does not, by values of the first."""
+    """Rows of a table: by values of the first key, up to or from which value of the second it holds and does not."""
     (first, second), largest = needed.keys, needed.wants[1] == "largest"
     holds, fails = ("holds up to", "not from") if largest else ("holds from", "not up to")
     values = np.array(second.values)
@@ -109,24 +109,24 @@ def _tell_ends(needed: Requirement) -> Iterator[str]:
     """`It holds up to latency_s 0.74; it does not hold from 0.78 on; it is undecided between.`"""
     largest, parts = needed.wants[0] == "largest", ["It holds nowhere"]
     ordered = needed.segments if largest else [(word, of[::-1]) for word, of in reversed(needed.segments)]
-    good = next((k for k, (word, _) in enumerate(ordered) if word == MET), None)
-    bad = next((k for k, (word, _) in enumerate(ordered) if word == NOT_MET and k >= (good or 0)), None)
-    if good is not None:
-        held = needed.name_values(ordered[good][1][-1].values)
+    first_met = next((k for k, (word, _) in enumerate(ordered) if word == MET), None)
+    first_not_met = next((k for k, (word, _) in enumerate(ordered) if word == NOT_MET and k >= (first_met or 0)), None)
+    if first_met is not None:
+        held = needed.name_values(ordered[first_met][1][-1].values)
         parts = [f"It holds up to {held}" if largest else f"It holds from {held} on"]
-    if bad is not None:
-        refuted = f"{ordered[bad][1][0].values[0]:g}"
+    if first_not_met is not None:
+        refuted = f"{ordered[first_not_met][1][0].values[0]:g}"
         parts.append(f"it does not hold from {refuted} on" if largest else f"it does not hold up to {refuted}")
     words = {word for word, _ in ordered}
     if words - {MET, NOT_MET}:
         side = "between" if {MET, NOT_MET} <= words else "above that" if largest == (MET in words) else "below that"
-        before = (f"{value:g}" for _, of in ordered[: good or 0] for value in of[0].values)
+        before = (f"{value:g}" for _, of in ordered[: first_met or 0] for value in of[0].values)
         parts.append(f"it is undecided {' and at '.join([side, *before])}")
     yield f"{'; '.join(parts)}."
-    sides = [one.level >= 2 for one in needed.trials]
-    turns = [k for k in range(1, len(sides)) if sides[k] != sides[k - 1]]
-    if len(turns) == 1 and UNDECIDED in words:
-        low, high = (needed.trials[k].values[0] for k in (turns[0] - 1, turns[0]))
+    is_good = [one.level >= 2 for one in needed.trials]
+    turn_ix = [k for k in range(1, len(is_good)) if is_good[k] != is_good[k - 1]]
+    if len(turn_ix) == 1 and UNDECIDED in words:
+        low, high = (needed.trials[k].values[0] for k in (turn_ix[0] - 1, turn_ix[0]))
         yield f"The figure itself crosses its bound between {low:g} and {high:g}."
 
 
@@ -155,7 +155,7 @@ def requirement_figure(needed: Requirement) -> Figure:
 
 
 def _draw_values(axes: Axes, needed: Requirement) -> None:
-    """A line with its intervals for each verdict, the bound, and behind them what holds."""
+    """Draw for each verdict a line with its intervals, the bound, and behind them what holds."""
     left, right = _draw_grounds(axes, needed)
     lines: dict[str, list[tuple[float, ...]]] = {}
     for trial in needed.trials:
@@ -173,7 +173,7 @@ def _draw_values(axes: Axes, needed: Requirement) -> None:
 
 
 def _draw_grounds(axes: Axes, needed: Requirement) -> tuple[float, float]:
-    """Bands of what holds and does not, hatched between. Returns the ends of the axis, which are beside the changes."""
+    """Draw bands of what holds and does not, hatched between. Returns the ends of the axis, beside the changes."""
     low, high = needed.keys[0].values[0], needed.keys[0].values[-1]
     ends = [(word, of[0].values[0], of[-1].values[0]) for word, of in needed.segments]
     changes = [x for _, *of in ends for x in of][1:-1] or [low, high]
@@ -191,7 +191,7 @@ def _draw_grounds(axes: Axes, needed: Requirement) -> tuple[float, float]:
 
 
 def _draw_front(axes: Axes, needed: Requirement) -> None:
-    """What holds at each pair of values; dots: pairs that were tried; a star: those of required.yaml."""
+    """Draw what holds at each pair of values; dots: pairs that were tried; a star: that of required.yaml."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 

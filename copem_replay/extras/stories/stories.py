@@ -85,7 +85,7 @@ def choose_stories(drive: Drive, table: pd.DataFrame, rows: pd.DataFrame) -> tup
 
 
 def _name_difference(story: ObjectStory) -> str:
-    """What tells configurations apart: `with rsu 2.30 s before PEM`, `never known`."""
+    """What tells configurations apart, in words: `known with rsu 2.30 s before PEM`, `never known`."""
     first, last, missed = story.first, story.last, story.rows[~story.rows["detected"]]
     if len(missed) == len(story.rows):
         return "never known"
@@ -100,6 +100,7 @@ def _name_difference(story: ObjectStory) -> str:
 
 
 def _story_element(story: ObjectStory) -> Html:
+    """The HTML of a story: its title, words, links, causes, what helps, and its pictures."""
     hider, words = story.hider, explain_story(story)
     title = make_tag("h3", f"{story.name}: {_name_difference(story)}")
     log, command = story.drive.log, story.study.view_command(story.drive.log, story.object_id)
@@ -108,10 +109,10 @@ def _story_element(story: ObjectStory) -> Html:
         "div", draw_story(story, hider, words), class_="scroll", tabindex="0", role="region", aria_label=story.name
     )
     helps = tell_what_helps(story.drive.experiment, story.rows)
-    late = why_late(read_why(story.study.results), story.drive.log, story.object_id, story.onset_s)
-    named = dict.fromkeys(str(row["configuration"]) for row in (story.first, story.last))
-    lines = [f"{name} {late.get(name, 'is not late')}" for name in named]
-    causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late else []
+    late_causes = why_late(read_why(story.study.results), story.drive.log, story.object_id, story.onset_s)
+    named_configurations = dict.fromkeys(str(row["configuration"]) for row in (story.first, story.last))
+    lines = [f"{name} {late_causes.get(name, 'is not late')}" for name in named_configurations]
+    causes = [make_tag("p", "Mean over all runs: ", "; ".join(lines), ".")] if late_causes else []
     causes = [make_tag("p", helps), *causes] if helps else causes
     return make_tag(
         "div", title, make_tag("p", words, *links), *causes, figure, class_="told", id_=story_id(log, story.object_id),

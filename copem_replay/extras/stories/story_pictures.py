@@ -63,18 +63,19 @@ class _View:
 
 
 def _draw_plans(story: ObjectStory, hider: StatusSpan | None) -> Iterator[Html]:
+    """The plans side by side: at the onset, when the object is first known, and when it is last known or never."""
     first, last = story.first, story.last
     short = story.short
-    known = (
+    plan_words = (
         f"{short[first['configuration']]} first",
         f"{short[last['configuration']]} {'last' if last['detected'] else 'never'}",
     )
     if not story.rows["detected"].any():  # halfway, and at its end
         first = first.copy()
         first["ended_s"], first["unknown_s"] = (story.onset_s + last["ended_s"]) / 2, first["unknown_s"] / 2
-        known = "not known", "never known"
+        plan_words = "not known", "never known"
     instants = [(story.onset_s, f"onset, {story.onset_s:.2f} s", None)]
-    for row, word in zip((first, last), known, strict=True):
+    for row, word in zip((first, last), plan_words, strict=True):
         instants.append((story.known_s(row), f"{format_seconds(row['unknown_s'])}: {word}", row))
     worlds = [world_at(story.drive, time_s) for time_s, _, _ in instants]
     box = _choose_box(story, worlds, hider)
@@ -112,7 +113,7 @@ def _places(world: Tracks, object_ix: int) -> Float:
 
 
 def _draw_plan(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: StatusSpan | None) -> Iterator[Html]:
-    """Boxes of all bodies, obstacles, units, and the line of who lists it, at the onset of who does not see it."""
+    """The SVG of one plan: bodies, obstacles, units, and a line from who lists the object (`row` None: the onset)."""
     drive, scene = story.drive, story.drive.scene
     yield make_tag("rect", x=f"{view.left}", y=f"{_TOP}", width=f"{_PLAN_W}", height=f"{_PLAN_H}", fill="#f7f7f7")
     wide_m, high_m = _PLAN_W / view.scale, _PLAN_H / view.scale
@@ -121,16 +122,16 @@ def _draw_plan(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: 
     for outline in drive.outlines():
         yield make_tag("polygon", points=view.points(outline), fill="#b3b3b3", stroke="#8c8c8c")
     number = scene.object_number[story.object_id]
-    looks = {number: (_OBJECT, _OBJECT), scene.ego_ix: ("#4d4d4d", "#262626")}
+    look_by_object = {number: (_OBJECT, _OBJECT), scene.ego_ix: ("#4d4d4d", "#262626")}
     if hider is not None and hider.body_ix >= 0:
-        looks[hider.body_ix] = ("#d9d9d9", _HIDER)
+        look_by_object[hider.body_ix] = ("#d9d9d9", _HIDER)
     corners_m, half_m = box_corners(world), np.array([_PLAN_W, _PLAN_H]) / view.scale / 2
     middle_m = np.array([view.west_m, view.north_m]) + half_m * [1, -1]
-    near = (np.abs(corners_m.mean(axis=1) - middle_m) <= half_m + _MARGIN_M).all(axis=1)
-    others = corners_m[near & ~np.isin(world.row_object_ix, list(looks))]
+    is_near = (np.abs(corners_m.mean(axis=1) - middle_m) <= half_m + _MARGIN_M).all(axis=1)
+    others = corners_m[is_near & ~np.isin(world.row_object_ix, list(look_by_object))]
     bodies = "".join(f"M{view.points(corners)}z" for corners in others)
     yield make_tag("path", d=bodies, fill="#d9d9d9", stroke="#8c8c8c")
-    for k, (fill, stroke) in looks.items():
+    for k, (fill, stroke) in look_by_object.items():
         for corners in corners_m[world.row_object_ix == k]:
             width = "3" if k == number else "2"
             yield make_tag("polygon", points=view.points(corners), fill=fill, stroke=stroke, stroke_width=width)
@@ -169,7 +170,7 @@ def place_words(bodies: Sequence[tuple[str, Float]], left: float) -> Iterator[tu
 
 
 def _draw_units(story: ObjectStory, world: Tracks, view: _View, row: Any, hider: StatusSpan | None) -> Iterator[Html]:
-    """Masts, and a line from the unit that lists the object, at the onset from one from which it is hidden then."""
+    """Masts, and a line from the unit that lists the object; at the onset (`row` None) from one it is hidden from."""
     drive = story.drive
     for at in drive.fixed_units().values():
         x, y = map(float, view.points(np.array([at])).split(","))
@@ -199,15 +200,16 @@ _SHADES = {"out of range or view": _OUT, "hidden": _HIDDEN, "in sight": _IN_SIGH
 
 
 def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
+    """A lane for each configuration, the soonest first, with the key of shades below."""
     rows = story.rows.sort_values("unknown_s", kind="stable")
     lane_names = pick_evenly([str(name) for name in rows["configuration"]], _LANES)
     rows = rows[rows["configuration"].isin(lane_names)]
     last_s = max(story.known_s(row) for _, row in rows.iterrows()) - story.onset_s
     scale = (_WIDTH - _LANE_LEFT - 60) / max(1.15 * last_s, JUDGED_S)
-    each = min(18.0, 84 / len(rows))
+    lane_height = min(18.0, 84 / len(rows))
     for k, (_, row) in enumerate(rows.iterrows()):
-        yield from _draw_lane(story, row, _LANES_TOP + k * each, each - 4, scale)
-    y = _LANES_TOP + len(rows) * each + 12
+        yield from _draw_lane(story, row, _LANES_TOP + k * lane_height, lane_height - 4, scale)
+    y = _LANES_TOP + len(rows) * lane_height + 12
     x = float(_LANE_LEFT)
     unlisted = any(span.status == NO_UNIT for name in lane_names for span in story.spans.get(name, ()))
     shades = _SHADES | ({"not listed": _UNLISTED} if unlisted else {})
@@ -219,9 +221,8 @@ def _draw_lanes(story: ObjectStory) -> Iterator[Html]:
 
 
 def _draw_lane(story: ObjectStory, row: Any, y: float, height: float, scale: float) -> Iterator[Html]:
-    """Spans of one configuration from the onset on: what its units have of it, on its way, known; and its time.
-
-    Known is thicker: some configurations are as grey as what is before.
+    """Spans of one configuration from the onset on (what units have of it, on its way, known), and its time. Known is
+    thicker: some configurations are as grey as what is before.
     """
     known_s, name = story.known_s(row), str(row["configuration"])
     shades = {HIDDEN: _HIDDEN, IN_SIGHT: _IN_SIGHT, NO_UNIT: _UNLISTED}

@@ -61,9 +61,8 @@ class Explanation:
         return {name: table for name, table in tables.items() if table is not None}
 
     def save(self, folder: AnyPath) -> list[Path]:
-        """Write the tables as CSV, all or none; those that are there are replaced. Raises OutputError.
-
-        In a results folder they go when its results go.
+        """Write the tables as CSV, all or none; those that are there are replaced. Raises OutputError. In a results
+        folder they go when its results go.
         """
         from copem_replay.results.outputs import made_files
 
@@ -74,7 +73,7 @@ class Explanation:
         return [place / name for name in self.files]
 
     def blocks(self, width: int | None = None) -> Iterator[list[str]]:
-        """The text for the terminal, part by part. `width`: None for a pipe."""
+        """The text for the terminal, a list of lines for each part. `width`: of the terminal, None for a pipe."""
         if self.causes is not None:
             for name, rows in self.causes.groupby("configuration", sort=False):
                 yield _describe_causes(str(name), rows, width)
@@ -135,7 +134,7 @@ def why(
 def _load_logs(
     source: AnyExperiment | Results, recordings: AnyRecordings | None
 ) -> tuple[Experiment, list[tuple[Recording, Experiment]]]:
-    """An experiment, and its recordings with the experiment of each; of results those that were replayed."""
+    """An experiment, and each recording with its own experiment; of results the recordings that were replayed."""
     if isinstance(source, str | PathLike) and Path(source).is_dir():
         source = open_results(Path(source))
     if isinstance(source, Results):
@@ -195,8 +194,8 @@ def _explain(
     latest: dict[int, Counterfactuals] = {}
     names, parts = question.select(experiment), question.parts
     if experiment.runs < _FEW_RUNS:
-        few = count_noun(experiment.runs, "run")
-        notes.append(f"{few}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
+        run_words = count_noun(experiment.runs, "run")
+        notes.append(f"{run_words}: with {_FEW_RUNS} standard errors of causes are about 2 % of the time unknown")
     steps = len(names) + ("sensitivity" in parts)
     for k, name in enumerate(names):
         its_logs = _select_logs(logs, [name])
@@ -253,7 +252,7 @@ class _PartTables(NamedTuple):
 def _explain_configuration(
     name: str, logs: Mapping[int, tuple[Recording, Experiment]], question: _Question, latest: dict[int, Counterfactuals]
 ) -> _PartTables:
-    """`logs`: by number; `latest`: likewise the replays of the configuration before, which are replaced."""
+    """The tables and errors, by part, of one configuration. `latest`: replays by log, of the configuration before."""
     from copem_replay.extras.why.causes import Counterfactuals, share_lateness, tabulate_causes
     from copem_replay.extras.why.triage import group_late_episodes, list_late_episodes, rank_groups
     from copem_replay.extras.why.worth import compute_unit_worths
@@ -273,8 +272,8 @@ def _explain_configuration(
                 result.tables["causes"] = tabulate_causes(shares)
             if "triage" in parts:
                 groups, episodes = zip(*(group_late_episodes(*of_log) for of_log in shares), strict=True)
-                some = [of for of in groups if len(of)] or groups[:1]
-                result.tables["triage"] = rank_groups(pd.concat(some, ignore_index=True))
+                late_groups = [of for of in groups if len(of)] or groups[:1]
+                result.tables["triage"] = rank_groups(pd.concat(late_groups, ignore_index=True))
                 result.tables["late"] = pd.concat([list_late_episodes(of) for of in episodes], ignore_index=True)
     if "units" in parts:
         try:
@@ -288,6 +287,7 @@ def _explain_configuration(
 
 
 def _describe_causes(name: str, causes: pd.DataFrame, width: int | None) -> list[str]:
+    """The table of seconds by cause of one configuration, as lines of text."""
     from copem_replay.extras.why.causes import NO_UNIT, describe_cause
 
     total_s, overlap_s = causes["added_s"].sum(), causes["gained_s"].sum()
@@ -324,6 +324,7 @@ def _describe_units(name: str, units: pd.DataFrame, width: int | None) -> list[s
 
 
 def _describe_groups(name: str, groups: pd.DataFrame) -> list[str]:
+    """Lines on the groups of late episodes of one configuration that cost most."""
     from copem_replay.extras.why.causes import describe_cause
     from copem_replay.extras.why.triage import TOO_SHORT, describe_structure
 

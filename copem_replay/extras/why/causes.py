@@ -311,7 +311,7 @@ class Counterfactuals:
         return replay_rows(self.replay, self.only)
 
     def unknown_s(self, gone: Sequence[Cause]) -> Float:
-        """(n,) seconds unknown of the rows that count, without some causes; each set of causes is replayed once."""
+        """(n,) seconds unknown of rows that count, without the causes `gone`; each set of these is replayed once."""
         experiment = reduce(lambda changed, cause: cause.remove(changed), gone, self.only)
         (configuration,) = experiment.configurations.values()
         key = experiment.model_copy(update={"configurations": {"": configuration}}).model_dump_json()
@@ -325,7 +325,6 @@ class Counterfactuals:
 
     def sight_s(self, removed: Sequence[Cause], after_s: Float) -> dict[str, Float]:
         """By cause of `_SIGHT` seconds (n,) of the first `after_s` (n,) after the onset of each row that counts.
-
         `removed`: all other causes, so that units list every frame of the truth.
         """
         experiment, rows = reduce(lambda changed, cause: cause.remove(changed), removed, self.only), self.rows

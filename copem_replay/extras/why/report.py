@@ -88,7 +88,7 @@ def _by_configuration(table: pd.DataFrame, write: Callable[[str, pd.DataFrame], 
 
 
 def _cause_table(causes: pd.DataFrame, value: str, caption: str) -> Html:
-    """Rows are causes, columns configurations."""
+    """A table of `value` (s): rows are causes, columns configurations; of `added_s` with their sum."""
     names = list(dict.fromkeys(causes["configuration"]))
     order = sorted(dict.fromkeys(causes["cause"]), key=_place_of_cause)
     seconds = causes.set_index(["configuration", "cause"])[value].astype(float).to_dict()
@@ -129,6 +129,7 @@ def _variation_table(means: pd.DataFrame) -> Html:
 
 
 def _group_list(name: str, groups: pd.DataFrame) -> Html:
+    """A list of the groups of late episodes of one configuration that cost most, with links to stories."""
     lost_s = float(groups["lost_s"].sum())
     lines = []
     for row in groups.head(_MOST_GROUPS).to_dict("records"):

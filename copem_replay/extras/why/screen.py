@@ -33,7 +33,7 @@ def tell_explanation(explained: Explanation, folder: str, *, one_log: bool) -> I
 
 
 def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
-    """A row for configurations with the same seconds, a column for each cause that adds any."""
+    """A table as lines: a row for configurations with equal seconds, a column for each cause that adds any."""
     added = causes.pivot(index="configuration", columns="cause", values="added_s")
     added = added.reindex(index=causes["configuration"].unique(), columns=causes["cause"].unique()).fillna(0.0)
     unknown_s = added.sum(axis=1)
@@ -48,10 +48,10 @@ def _tabulate_seconds(causes: pd.DataFrame) -> list[str]:
 
 
 def _tell_units(units: pd.DataFrame) -> list[str]:
-    """What units spare beside those that are given, the most first; what is alike stands together."""
-    most = units.groupby("unit")["share_s"].max().sort_values(ascending=False, kind="stable")
+    """Sentences on what units spare beside those that are given, the most first; equal ones stand together."""
+    largest_share = units.groupby("unit")["share_s"].max().sort_values(ascending=False, kind="stable")
     groups: dict[str, list[str]] = {}
-    for unit in most.index:
+    for unit in largest_share.index:
         by_words: dict[str, list[str]] = {}
         for row in units[units["unit"] == unit].itertuples(index=False):
             saved = f"{row.share_s:.2f} s" if abs(row.share_s) >= VISIBLE_S else "nothing"
@@ -63,19 +63,19 @@ def _tell_units(units: pd.DataFrame) -> list[str]:
 
 
 def _tell_late(groups: pd.DataFrame, folder: str, *, one_log: bool) -> list[str]:
-    """The group of late episodes that costs most, and how to look at one."""
+    """Sentences on the group of late episodes that costs most, and a command to look at one."""
     if not len(groups):
         return [f"No object is unknown for more than {LATE_S:g} s in 5 % of the runs or more."]
-    worst = groups.loc[groups["lost_s"].idxmax()]
-    where = f" ({worst['where']})" if worst["where"] else ""
-    named, count = f"{worst['example_class']} {worst['example']}", int(worst["objects"])
-    objects = f"{count_noun(count, 'object')} such as {named}" if count > 1 else named
-    objects = objects if worst["example"] else f"{count_noun(count, 'object')}, {TOO_SHORT}"
+    worst_group = groups.loc[groups["lost_s"].idxmax()]
+    where = f" ({worst_group['where']})" if worst_group["where"] else ""
+    example_words, count = f"{worst_group['example_class']} {worst_group['example']}", int(worst_group["objects"])
+    objects = f"{count_noun(count, 'object')} such as {example_words}" if count > 1 else example_words
+    objects = objects if worst_group["example"] else f"{count_noun(count, 'object')}, {TOO_SHORT}"
     shown = groups[groups["example"] != ""].sort_values("lost_s", ascending=False, kind="stable").head(1)
-    how = describe_structure(float(worst["structural_share"]))
+    structure_words = describe_structure(float(worst_group["structural_share"]))
     return [
-        f"Most is lost in {worst['configuration']}: {worst['lost_s']:.1f} s, {objects}: "
-        f"{describe_cause(str(worst['cause']))}{where}{how}.",
+        f"Most is lost in {worst_group['configuration']}: {worst_group['lost_s']:.1f} s, {objects}: "
+        f"{describe_cause(str(worst_group['cause']))}{where}{structure_words}.",
         *(
             f"    copem-replay view {folder} --object {row.example}" + ("" if one_log else f" --log {row.log}")
             for row in shown.itertuples()

@@ -82,6 +82,8 @@ def _widen_errors(experiment: Experiment) -> Experiment:
 
 
 def _remember_longer(experiment: Experiment) -> Experiment:
+    """The experiment in which lasting detection of all PEMs lasts twice as long."""
+
     def longer(memory: Memory | None) -> Any:
         if memory is None or "detection" not in memory:
             return memory
@@ -135,6 +137,7 @@ def vary_pems(
 
 
 def _select_modelled(experiment: Experiment, names: Sequence[str] | None) -> Experiment:
+    """The experiment with configurations of modelled units alone (of `names`). Raises ExperimentError: none."""
     configurations = {
         name: configuration
         for name, configuration in experiment.configurations.items()

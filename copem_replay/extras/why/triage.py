@@ -133,7 +133,7 @@ def find_places(replay: Replay, episodes: pd.DataFrame) -> list[tuple[str, str]]
 
 
 def _find_bodies(replay: Replay, objects: Int, begin_s: Float, until_s: Float) -> list[str]:
-    """The words of lanes: who hides each object longest from the units that have it in view."""
+    """By object the words for who hides it longest from the units that have it in view; “”: nobody."""
     (one,) = replay.expanded.configurations.values()
     names, shown = replay.expanded.units_of(one), list(dict.fromkeys(objects.tolist()))
     sight, words = compute_sight(replay, replay.expanded, shown), []
@@ -147,7 +147,7 @@ def _find_bodies(replay: Replay, objects: Int, begin_s: Float, until_s: Float) -
 
 
 def _find_sides(replay: Replay, objects: Int, at_s: Float) -> list[str]:
-    """`ahead`, `left`, `behind` or `right` of the ego at an instant; empty without an ego there."""
+    """By object `ahead`, `left`, `behind` or `right` of the ego at its instant (s); “”: the ego is not there."""
     truth, ego = replay.truth, replay.scene.ego_ix
     if ego < 0:
         return [""] * len(objects)

@@ -128,20 +128,20 @@ def _is_product(experiment: Experiment, name: str) -> bool:
 def _list_curves(
     recording: Recording, experiment: Experiment, name: str, judged: Sequence[str], others: Sequence[str]
 ) -> Iterator[UnitCurves]:
-    """The curves of each episode that counts; what is given is part of the lengths of spans."""
-    one, configurations = experiment.configurations[name], {}
+    """For each episode that counts the share unknown over time, by unit `judged`; `others` are always there."""
+    configuration, configurations = experiment.configurations[name], {}
     for unit in (*judged, *others):
-        configurations[unit] = one.model_copy(update={"units": (unit,)})
+        configurations[unit] = configuration.model_copy(update={"units": (unit,)})
     singles = experiment.model_copy(update={"configurations": configurations})
     replay = prepare_log(recording, singles)
     table = select_counted(exact_table(replay, singles), experiment.measure.began)
     for _, rows in table.groupby(["object_id", "episode"], sort=False):
         onset_s, ended_s = float(rows["onset_s"].iloc[0]), float(rows["ended_s"].iloc[0])
-        known = rows.dropna(subset="detection_s")
-        at_s = np.unique(np.clip([onset_s, *known["detection_s"], ended_s], onset_s, ended_s))
+        detections = rows.dropna(subset="detection_s")
+        at_s = np.unique(np.clip([onset_s, *detections["detection_s"], ended_s], onset_s, ended_s))
         unknown = np.ones((len(configurations), max(len(at_s) - 1, 0)))
         for k, unit in enumerate(configurations):
-            curve = known[known["configuration"] == unit].sort_values("detection_s")
+            curve = detections[detections["configuration"] == unit].sort_values("detection_s")
             last = np.searchsorted(np.maximum(curve["detection_s"].to_numpy(), onset_s), at_s[:-1], side="right") - 1
             incidence = np.append(curve["incidence"].to_numpy(), 0.0)  # −1: none yet
             unknown[k] = 1 - incidence[last]
@@ -180,7 +180,7 @@ def share_by_curves(units: Sequence[str], curves: Sequence[UnitCurves]) -> UnitW
 def _replay_sets(
     logs: Sequence[tuple[Recording, Experiment]], name: str, judged: Sequence[str], others: Sequence[str]
 ) -> dict[frozenset[str], float]:
-    """The mean time unknown of each set of the units asked about, beside those that are given."""
+    """By set of the `judged` units the mean time unknown (s) with it, beside the `others`, by replay."""
     sets = [frozenset(unit_set) for size in range(len(judged) + 1) for unit_set in combinations(judged, size)]
     total_s, count = dict.fromkeys(sets, 0.0), dict.fromkeys(sets, 0)
     for recording, experiment in logs:
@@ -189,8 +189,8 @@ def _replay_sets(
             units = tuple(unit for unit in experiment.units if unit in unit_set or unit in others)
             if units:
                 configurations[str(number)] = experiment.configurations[name].model_copy(update={"units": units})
-        several = experiment.model_copy(update={"configurations": configurations})
-        rows = replay_rows(prepare_log(recording, several), several)
+        joint_experiment = experiment.model_copy(update={"configurations": configurations})
+        rows = replay_rows(prepare_log(recording, joint_experiment), joint_experiment)
         for number, of_set in rows.groupby("configuration", sort=False):
             total_s[sets[int(str(number))]] += of_set["unknown_s"].sum()
             count[sets[int(str(number))]] += len(of_set)

@@ -190,6 +190,7 @@ def read_record_at(file: IO[bytes], offset: int, opcode: int) -> bytes:
 
 
 def _split_records(plain: bytes | bytearray) -> Iterator[McapRecord]:
+    """The records in a decompressed chunk. Raises DAMAGE: one is cut off, unknown, or there are too many."""
     offset = number = 0
     view = memoryview(plain)  # a slice of it copies nothing: a message may be as large as its chunk
     while offset < len(plain):
@@ -214,7 +215,7 @@ def _split_records(plain: bytes | bytearray) -> Iterator[McapRecord]:
 def _decompress(
     compression: bytes, content: memoryview, claimed: int, allowance: ChunkAllowance
 ) -> tuple[bytes | bytearray, bool]:
-    """The decompressed bytes, as far as they go, and whether they are all. Raises DAMAGE."""
+    """The decompressed bytes of a chunk, as far as they go, and whether they are all. Raises DAMAGE."""
     if compression == b"zstd":
         return _decompress_zstd(content, claimed, allowance)
     if compression == b"lz4":
@@ -239,11 +240,12 @@ def _decompress_zstd(content: memoryview, claimed: int, allowance: ChunkAllowanc
 
 
 def _decompress_lz4(content: memoryview, allowance: ChunkAllowance) -> tuple[bytearray, bool]:
+    """The decompressed bytes, as far as they go, and whether they are all; never more than the limit."""
     plain, reader = bytearray(), lz4.frame.LZ4FrameDecompressor()
-    fed: bytes | memoryview = content
+    next_input: bytes | memoryview = content
     while not reader.eof:
-        piece = reader.decompress(fed, max_length=_PIECE_BYTES)
-        fed = b""
+        piece = reader.decompress(next_input, max_length=_PIECE_BYTES)
+        next_input = b""
         plain += piece
         if len(plain) > CHUNK_LIMIT_BYTES:
             raise allowance.refuse()
@@ -283,6 +285,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
 
 
 def _parse_summary(section: bytes) -> Summary:
+    """The records of the summary section of a file. Raises DAMAGE."""
     summary, stream = Summary(), BytesIO(section)
     # Chunks stay closed: an index may point at anything.
     records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=RECORD_LIMIT_BYTES).records
@@ -386,6 +389,7 @@ class RecordsFromStart:
         self.complete &= complete
 
     def _records(self) -> Iterator[McapRecord]:
+        """The records from the start of the file, as far as they can be read; `error` says why no further."""
         self._file.seek(0)
         size, allowance = os.fstat(self._file.fileno()).st_size, ChunkAllowance(self._file)
         checksum = zlib.crc32(self._file.read(len(MAGIC)))

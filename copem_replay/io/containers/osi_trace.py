@@ -146,7 +146,7 @@ def _make_log_times(stamp_ns: Int) -> Int:
 
 
 def _read_payloads(file: IO[bytes], cut: list[str]) -> Iterator[tuple[int, bytes]]:
-    """Offset and bytes of each message, as far as they go; `cut` gets the reason why no further."""
+    """Offset and bytes of each message, as far as they go; at damage the reason is appended to `cut`."""
     size = os.fstat(file.fileno()).st_size
     offset = 0
     while offset < size:
@@ -173,7 +173,7 @@ def _time_ns(message: Any) -> int | None:
 
 
 def _find_schema(path: Path, named: str) -> tuple[str, list[str]]:
-    """The schema of the messages, and a note where it is not that of the file's name. Raises RecordingError."""
+    """The schema of the messages, and a note if the file's name (`named`) says another. Raises RecordingError."""
     if named in _NOT_READ:
         raise RecordingError(
             f"osi3.{_NOT_READ[named]} by its name, which is not read; {', '.join(_READ)} are", path=path
@@ -184,12 +184,12 @@ def _find_schema(path: Path, named: str) -> tuple[str, list[str]]:
             file.seek(0)
             raise unsupported_file_error("an OSI trace", path, file.read(64))
     share = {schema: _explained_share(first, schema) for schema in _READ.values()}
-    best, second = sorted(share, key=lambda schema: -share[schema])[:2]
-    if named in _READ and (share[_READ[named]] == share[best] or share[best] < _EXPLAINED):
+    best_schema, second_schema = sorted(share, key=lambda schema: -share[schema])[:2]
+    if named in _READ and (share[_READ[named]] == share[best_schema] or share[best_schema] < _EXPLAINED):
         return _READ[named], []
-    if share[best] >= _EXPLAINED and share[best] > share[second]:
+    if share[best_schema] >= _EXPLAINED and share[best_schema] > share[second_schema]:
         by_name = f"says {named}" if named in _READ else "does not say"
-        return best, [f"taken for {best} by its messages: the name of the file {by_name}"]
+        return best_schema, [f"taken for {best_schema} by its messages: the name of the file {by_name}"]
     raise RecordingError(
         f"its messages can be told for none of {', '.join(share)}; if they are, name the file by OSI's "
         f"convention: 20260102T030405Z_gt_380_2961_{len(first)}_name.osi",
@@ -198,7 +198,7 @@ def _find_schema(path: Path, named: str) -> tuple[str, list[str]]:
 
 
 def _explained_share(payloads: Sequence[bytes], schema: str) -> float:
-    """Share of the bytes of messages that have a meaning in a schema, from 0 to 1."""
+    """Share (0 to 1) of the messages' bytes that are known fields of a schema; high for the right one."""
     explained_bytes = 0
     for payload in payloads:
         try:

@@ -54,7 +54,7 @@ def note_unnamed_files(folder: Path, named: Sequence[Path]) -> Iterator[str]:
 
 
 def _find_information(folder: Path) -> Node:
-    """The mapping in the folder's description. Raises RecordingError: there is none."""
+    """The mapping in the folder's `metadata.yaml`. Raises RecordingError: there is none, or it is unreadable."""
     place = folder / METADATA
     try:
         with place.open("rb") as file:
@@ -88,7 +88,7 @@ def _list_file_names(information: Node) -> list[str]:
 
 
 def _bag_file_path(folder: Path, name: str) -> Path:
-    """A named file, or what it was unpacked to. Raises RecordingError: outside of the folder, missing, compressed."""
+    """The path of a named file, or of what it was unpacked to. RecordingError: outside, missing, compressed."""
     path = folder / name
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\0" in name:
         raise RecordingError(f"expected files of the folder, found {name!r}", path=folder / METADATA)
@@ -158,10 +158,7 @@ class BagLog(Log):
     lost: tuple[str, ...] = ()  # files that cannot be read at all, and why
 
     def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
-        """Messages of some channels in order of log time, of equal ones in the order of the files.
-
-        Raises BrokenIndexError.
-        """
+        """Messages of these channels by log time; at equal times in the order of files. Raises BrokenIndexError."""
         streams: list[tuple[int, Callable[[], Iterator[Message]]]] = []
         for part in self.parts:
             numbers_in_log = {theirs: ours for theirs, ours in part.numbers.items() if ours in numbers}
@@ -209,6 +206,7 @@ def open_bag(folder: Path) -> BagLog:
 
 
 def _join_bag_files(folder: Path, logs: Sequence[Log], unread: Sequence[str], notes: tuple[str, ...]) -> BagLog:
+    """One log of a bag's files. `unread`: a line for each that cannot be read. Raises RecordingError: no file can."""
     if not logs:
         first, *others = unread
         more = f"; and so on, {count_noun(len(unread), 'file')} in all" if others else ""
@@ -224,7 +222,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], unread: Sequence[str], no
             number = numbers_of_log[c.number] = numbers.setdefault(key, len(numbers) + 1)
             channels[number] = _merge_channels(channels[number], c) if number in channels else replace(c, number=number)
         parts.append(BagFile(log, numbers_of_log))
-    last = max(log.start_ns for log in logs)
+    last_start_ns = max(log.start_ns for log in logs)
     of_files = [f"{log.path.name}: {note}" for log in logs for note in log.notes]
     return BagLog(
         path=folder,
@@ -232,7 +230,7 @@ def _join_bag_files(folder: Path, logs: Sequence[Log], unread: Sequence[str], no
         indexed=all(log.indexed for log in logs),
         damage="; ".join([*damages, *unread]) or None,
         complete=not unread and all(log.complete for log in logs),
-        went_on=bool(unread) or any(log.went_on or log.start_ns < last for log in logs if not log.complete),
+        went_on=bool(unread) or any(log.went_on or log.start_ns < last_start_ns for log in logs if not log.complete),
         start_ns=min(log.start_ns for log in logs),
         end_ns=max(log.end_ns for log in logs),
         notes=tuple(dict.fromkeys([*notes, *of_files])),

@@ -30,7 +30,7 @@ class SqliteLog(Log):
     """The log of a file of SQLite."""
 
     def messages(self, numbers: Set[int], *, sort: bool = False) -> Iterator[Message]:
-        """Messages of some channels in order of log time. Raises RecordingError: the file is damaged."""
+        """Messages of these channels in order of log time. Raises RecordingError: the file is damaged."""
         spans = self.spans(numbers)
         if not spans:
             return
@@ -64,7 +64,7 @@ def open_sqlite(path: Path) -> SqliteLog:
 
 @contextmanager
 def _open_reader(path: Path) -> Iterator[Sqlite3Reader]:
-    """Rosbags' reader of a file. Raises RecordingError: it is none of rosbag2, or damaged, also while it is read."""
+    """Rosbags' reader of a file, closed at the end. Raises RecordingError: damaged, or no file of rosbag2."""
     import apsw
     from rosbags.rosbag2 import ReaderError
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader

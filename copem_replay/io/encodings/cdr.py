@@ -253,7 +253,7 @@ class CdrProgram:
             self._add_list(kind == FIXED_ARRAY, item, number, path)
 
     def _add_list(self, fixed: bool, item: Any, number: int, path: str) -> None:
-        """Add a list: as one text if that is wanted, then its chosen items, then the whole list."""
+        """Add the steps that read a list: as a text if that is wanted, then chosen items, then the list itself."""
         base = item[1][0] if item[0] == BASE else ""
         size = BASES[base][0] if base in BASES else 0
         level = self._level.get(f"{path}[]", -1)
@@ -264,25 +264,26 @@ class CdrProgram:
             self.kinds[path] = ValueKind("bytes")
             self._add(BYTES, number, column, of) if fixed else self._add(TEXT, column, 1, of)
             self._add(BACK)
-        if picked := self._picked.get(path):
-            before = 0
-            for k in sorted(picked):
-                if k > before:
-                    self._skip(size, k - before)
+        if picked_items := self._picked.get(path):
+            next_item = 0
+            for k in sorted(picked_items):
+                if k > next_item:
+                    self._skip(size, k - next_item)
                 self._add_base(base, f"{path}[{k}]")
-                before = k + 1
+                next_item = k + 1
             self._add(BACK)
         if size and level < 0:
             self._skip(size, number) if fixed else self._add(NUMBERS, size)
             return
         if not size:
             self._add(SIZE)
-        head = self._add(ARRAY, number, 0, level) if fixed else self._add(LIST, 0, level)
+        list_step = self._add(ARRAY, number, 0, level) if fixed else self._add(LIST, 0, level)
         self._add_node(item, f"{path}[]")
         self._add(NEXT)
-        self._rows[head][2 if fixed else 1] = len(self._rows)
+        self._rows[list_step][2 if fixed else 1] = len(self._rows)
 
     def _add_base(self, name: str, path: str) -> None:
+        """Add the step that reads, or skips, one number or text of type `name`."""
         column = self._column.get(path, -1)
         level = self._level.get(list_level(path), 0)
         if name == STRING_TYPE:
@@ -343,7 +344,7 @@ class CdrDefinition(Definition):
         return 0 <= item < self._arrays.get(array, 0)
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
-        """The columns of messages. Raises KeyError for a path that is neither offered nor picked; OversizeError."""
+        """The columns of messages. Raises KeyError: a path is neither offered nor picked; OversizeError."""
         paths = self._known((*(numbers := tuple(numbers)), *(texts := tuple(texts))))
         builder = CdrProgram(self._types, paths, list_levels(paths))
         builder.add_type(self._name, "")
@@ -368,6 +369,7 @@ class CdrDefinition(Definition):
             self._explore_node(node, f"{path}.{field}" if path else field, (*outer_types, name))
 
     def _explore_node(self, node: Any, path: str, outer_types: tuple[str, ...]) -> None:
+        """Add the leaves at and below a node to the offered paths. Raises DefinitionError: too many or too long."""
         self._explored += 1
         if self._explored > _MOST_FIELDS:
             raise DefinitionError(f"the definition of {self._name} has more than {_MOST_FIELDS} fields")
@@ -392,7 +394,7 @@ _SEPARATOR = re.compile(r"^={10,}[ \t]*$", re.MULTILINE)
 
 @lru_cache(maxsize=32)  # a definition is needed several times: for the survey, the truth, the lists of units
 def _parse_definition(text: str, name: str, encoding: str) -> dict[str, Any]:
-    """The types a schema defines, by name. Raises whatever rosbags does."""
+    """By name the types that a schema defines, as rosbags parses them. Raises whatever rosbags does."""
     # Imported here: recordings of other kinds have no use for it.
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 

@@ -106,7 +106,7 @@ class _Program:
         self._pooled = 0
 
     def add_type(self, name: str, content: Content | Instants) -> None:
-        """Add all fields of a type, in their order. Raises KeyError for content of no field."""
+        """Add the steps that write all fields of a type, in their order. Raises KeyError: content of no field."""
         if isinstance(content, Instants):
             seconds, nanoseconds = np.divmod(content.time_ns, 1_000_000_000)
             content = {"sec": np.clip(seconds, _FIRST_S, _LAST_S), "nanosec": nanoseconds}

@@ -306,6 +306,7 @@ def _is_constant(value: Any) -> bool:
 
 
 def _encode_field(field: FieldDescriptor, value: Any, rows: int) -> RecordPart:
+    """The bytes of one field of protobuf for each of `rows` messages; `value`: a constant, a column or content."""
     if rows != 1 and _is_constant(value):
         return repeat_text(encode_records([_encode_field(field, value, 1)], 1)[0], rows)
     number = field.number << 3
@@ -348,7 +349,7 @@ def encode_json(content: JsonContent, rows: int) -> list[bytes]:
 
 
 def _encode_value(value: Any, rows: int) -> list[RecordPart]:
-    """The parts of a value of JSON."""
+    """The texts of which the JSON of a value is made, for each of `rows` messages."""
     if value is None:
         return [repeat_text(b"null", rows)]
     if isinstance(value, RowTexts):
@@ -360,14 +361,14 @@ def _encode_value(value: Any, rows: int) -> list[RecordPart]:
         return _encode_arrays(value.start, _encode_value(value.content, int(value.start[-1])))
     if isinstance(value, Mapping):
         parts: list[RecordPart] = []
-        for name, inner in value.items():
+        for name, inner_value in value.items():
             key = b"%s%s:" % (b"," if parts else b"{", orjson.dumps(name))
-            if isinstance(inner, StatedRows) and not inner.null:
-                there = int(inner.said.sum())
-                field = [repeat_text(key, there), *_encode_value(inner.values, there)]
-                parts.append(RowGroups(start_offsets(inner.said), field))
+            if isinstance(inner_value, StatedRows) and not inner_value.null:
+                stated_count = int(inner_value.said.sum())
+                field = [repeat_text(key, stated_count), *_encode_value(inner_value.values, stated_count)]
+                parts.append(RowGroups(start_offsets(inner_value.said), field))
             else:
-                parts += [repeat_text(key, rows), *_encode_value(inner, rows)]
+                parts += [repeat_text(key, rows), *_encode_value(inner_value, rows)]
         return [*parts, repeat_text(b"}", rows)]
     return [_encode_numbers(value, rows)]
 

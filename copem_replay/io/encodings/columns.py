@@ -148,7 +148,9 @@ def _chosen_items(path: str) -> list[int]:
 
 
 def _choose_level(levels: dict[str, LevelRows], chosen_rows: dict[str, Int], name: str) -> None:
-    """Add the level `name` and its parents, with only the rows of the list items in its path, also to `chosen_rows`."""
+    """Add the level `name` and its parents to `levels`, with only the list items that its path chooses (`[k]`);
+    `chosen_rows`: their rows in the level of all items.
+    """
     if name in levels:
         return
     outer = parent_level(name)
@@ -291,7 +293,7 @@ class _RawColumn:
         return values
 
     def texts(self) -> DistinctTexts:
-        """All values as texts; code −1: no value."""
+        """All values as texts: distinct ones, and by row the index (code) of its text; −1: no value."""
         code: Int
         if self._kind.is_number:
             values, code = np.unique(join_arrays(self._values, np.float64), return_inverse=True)

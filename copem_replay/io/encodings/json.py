@@ -68,7 +68,7 @@ class JsonDefinition(Definition):
             self._look_at(payload)
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
-        """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
+        """The columns of messages. Raises KeyError: a path is not offered; OversizeError."""
         for payload in payloads:
             check_json(payload)
         numbers, texts = tuple(dict.fromkeys(numbers)), tuple(dict.fromkeys(texts))
@@ -94,7 +94,7 @@ class JsonDefinition(Definition):
         return message is not None and (any(lists) or not lists)
 
     def _explore(self, value: Any, path: str, lists: list[bool], depth: int = 0) -> None:
-        """Add all leaves below a value to the offered ones, and to each list whether it has items."""
+        """Add all leaves below a value to the offered paths; `lists` gets whether each list on the way has items."""
         if depth > _DEEPEST or len(self._offers) >= _MOST_FIELDS:
             return
         if isinstance(value, dict):
@@ -157,7 +157,7 @@ class _RowTable:
         self._words: dict[str, dict[str, int]] = {path: {} for path in texts}
 
     def add(self, trees: Sequence[Any], number: Int, *, exact: bool) -> None:
-        """Add the messages of these numbers. Raises one of `_UNLIKE`, and then adds nothing."""
+        """Add decoded messages (`trees`) as rows; `number`: of each. Raises one of `_UNLIKE`, then nothing is added."""
         batch = _Batch({"": number}, self._rows, exact)
         batch.visit(self._root, trees)
         for name, parent in batch.parents.items():
@@ -197,7 +197,7 @@ class _Batch:
         self.texts: dict[str, list[str | None]] = {}
 
     def visit(self, place: _WantedPlace, values: Sequence[Any]) -> None:
-        """Take the wanted columns at and below a place, from its value in every row; None: the row has none."""
+        """Take the wanted columns at and below a place of the tree; `values`: there in each row, None: it has none."""
         if place.number is not None:
             self.numbers[place.number] = _convert_numbers(values)
         if place.text is not None:
@@ -243,6 +243,7 @@ def _convert_number(value: Any) -> float:
 
 
 def _plan_places(numbers: Sequence[str], texts: Sequence[str]) -> _WantedPlace:
+    """The tree of wanted places, by field names and list items, from the paths of numbers and texts."""
     root = _WantedPlace("")
     for path, is_text in (*((p, False) for p in numbers), *((p, True) for p in texts)):
         place, prefix = root, ""

@@ -45,7 +45,7 @@ DEEPEST = 32
 
 @callee
 def _read_varint(data: NDArray[np.uint8], offset: Any, end: Any) -> tuple[np.uint64, Any]:
-    """A number and the place after it, which is beyond `end` if the number does not end before."""
+    """A varint and the offset after it; an offset beyond `end` says that the number does not end before."""
     value, shift = np.uint64(0), 0
     while offset < end and shift < 70:
         byte = data[offset]
@@ -67,7 +67,7 @@ def _read_fixed(data: NDArray[np.uint8], offset: Any, size: Any) -> np.uint64:
 
 @callee
 def _skip_value(data: NDArray[np.uint8], offset: Any, end: Any, wire: Any) -> Any:
-    """The end of a value that begins at `offset`, of a group the place of its end tag; beyond `end`: it has no end."""
+    """The offset after a value (of a group: of its end tag); beyond `end`: the value does not end before."""
     if wire == VARINT:
         return _read_varint(data, offset, end)[1]
     if wire == FIXED64:
@@ -77,17 +77,17 @@ def _skip_value(data: NDArray[np.uint8], offset: Any, end: Any, wire: Any) -> An
     if wire == BYTES:
         size, offset = _read_varint(data, offset, end)
         return end + 1 if offset > end or size > np.uint64(end - offset) else offset + np.int64(size)
-    depth = 1
+    group_depth = 1
     while offset < end:
-        mark = offset
+        tag_offset = offset
         tag, offset = _read_varint(data, offset, end)
         inner = np.int64(tag & np.uint64(7))
         if inner == GROUP:
-            depth += 1
+            group_depth += 1
         elif inner == END_GROUP:
-            depth -= 1
-            if depth == 0:
-                return mark
+            group_depth -= 1
+            if group_depth == 0:
+                return tag_offset
         elif inner > FIXED32:
             return end + 1
         else:
@@ -351,15 +351,15 @@ class ProtobufDefinition(Definition):
         return self._names.get(path, {})
 
     def shred(self, payloads: Sequence[bytes], numbers: Iterable[str], texts: Iterable[str]) -> ShreddedMessages:
-        """The columns of messages. Raises KeyError for a path that is not offered; OversizeError."""
+        """The columns of messages. Raises KeyError: a path is not offered; OversizeError."""
         numbers, texts = tuple(numbers), tuple(texts)
         table = _FieldTable(self._root, self._known((*numbers, *texts)))
 
         def canonical() -> Iterator[tuple[Int, list[bytes]]]:
             for batch in split_batches(payloads):
-                whole = [self._canonical(payload, table.closed) for payload in payloads[batch]]
-                good = batch.start + np.flatnonzero([p is not None for p in whole])
-                yield good, [p for p in whole if p is not None]
+                canonical_payloads = [self._canonical(payload, table.closed) for payload in payloads[batch]]
+                decoded_numbers = batch.start + np.flatnonzero([p is not None for p in canonical_payloads])
+                yield decoded_numbers, [p for p in canonical_payloads if p is not None]
 
         return walk_columns(table.walk, canonical(), table.kinds, numbers, texts, len(payloads))
 
@@ -376,7 +376,7 @@ class ProtobufDefinition(Definition):
         return written
 
     def _explore(self, root: Any) -> None:
-        """Add all leaves to the offered ones, those of outer messages first: definitions may refer to themselves."""
+        """Add all leaves to the offered paths, outer messages first: definitions may refer to themselves."""
         level = [(root, "")]
         for _ in range(_DEEPEST):
             inner = []

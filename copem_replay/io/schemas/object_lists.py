@@ -104,6 +104,7 @@ class WantedPaths:
         return self._need(key, self.path(path), f"{self._fields.objects}.")
 
     def _columns(self) -> tuple[list[str], list[str]]:
+        """The paths of numbers and of texts to decode. Raises InputError where messages lack one."""
         fields, described = self._fields, self._described
         numbers: list[str] = []
         texts: list[str] = []
@@ -120,8 +121,8 @@ class WantedPaths:
             if fields.yaw_rad.degrees is not None:
                 numbers.append(self._of_object("yaw_rad.degrees", fields.yaw_rad.degrees))
             elif fields.yaw_rad.quaternion is not None:
-                head = fields.yaw_rad.quaternion
-                numbers += [self._of_object("yaw_rad.quaternion", f"{head}.{axis}") for axis in "xyzw"]
+                quaternion_path = fields.yaw_rad.quaternion
+                numbers += [self._of_object("yaw_rad.quaternion", f"{quaternion_path}.{axis}") for axis in "xyzw"]
         if fields.covariance is not None:
             numbers += [self._of_object("covariance", f"{fields.covariance}[{k}]") for k in (0, 1, 7)]
         if fields.id is not None:
@@ -150,7 +151,7 @@ class WantedPaths:
         return numbers, texts
 
     def shred(self, definition: Definition, payloads: Sequence[bytes]) -> ShreddedMessages:
-        """The columns of messages, with those that are made of others."""
+        """The columns of messages, with those that the description makes of others."""
         plain = ([path for path in paths if path not in self.made] for paths in (self.numbers, self.texts))
         shredded = shred_messages(definition, payloads, *plain)
         for name, (make, *of) in self.made.items():
@@ -342,7 +343,7 @@ class _BatchReader:
         return DistinctTexts(texts.code[ancestor_rows(self._found, self._fields.objects, level)], texts.words)
 
     def _stamps(self, log_time_ns: Int) -> tuple[Int, Bool]:
-        """(F,) time stamps of all messages, else their log times, and (F,) whether they have one."""
+        """(F,) time stamps (ns) of all messages, else their log times, and (F,) whether they state one."""
         stamp_ns, stamped = log_time_ns.copy(), np.zeros(len(log_time_ns), dtype=bool)
         paths, stamp = self._wanted.stamp, self._fields.stamp
         if not paths:
@@ -358,7 +359,7 @@ class _BatchReader:
         return stamp_ns, stamped
 
     def _settled_stamps(self, log_time_ns: Int, ahead_ns: int) -> tuple[Int, Int, Bool]:
-        """The messages that are decoded and kept (K,), their stamps by the clock of log times, and whether stated."""
+        """The decoded messages that are kept (K,), their stamps by the clock of log times, and whether stated."""
         self._impossible = 0
         stamp_ns, stamped = self._stamps(log_time_ns)
         self._notes += find("stamp impossible", self._impossible)
@@ -388,7 +389,7 @@ class _BatchReader:
         return np.where(np.hypot(np.hypot(x, y), np.hypot(z, w)) <= _LONGEST_QUATERNION, yaw, np.nan)
 
     def _classes(self, keep: Int) -> Float:
-        """(K, C) probability of each class of the objects `keep`, sums to 1."""
+        """(K, C) probability of each class of the objects `keep`; rows sum to 1. No class stated: `other`."""
         rows = self.rows(self._fields.objects)
         class_field = self._wanted.class_
         probability = np.zeros((rows, len(CLASSES)))
@@ -399,22 +400,22 @@ class _BatchReader:
             texts = self._found.levels[level].texts[class_path]
             known_as = self._by_name(any_item_path(class_path), class_field.map)
             names = [word.strip() and (known_as.get(word) or class_from_name(word) or "other") for word in texts.words]
-            of_word = np.array([CLASSES.index(name) if name else -1 for name in names] + [-1])
-            code = of_word[texts.code]
+            class_of_word = np.array([CLASSES.index(name) if name else -1 for name in names] + [-1])
+            code = class_of_word[texts.code]
             self._note_other_names(texts, ["" if w in known_as else class_from_name(w) for w in texts.words])
             share = np.ones(len(code))
             if class_field.probability is not None:
-                of_share = self._wanted.path(class_field.probability)
-                share = self._found.levels[list_level(of_share)].numbers[of_share]
-                share = share[ancestor_rows(self._found, level, list_level(of_share))]
+                share_path = self._wanted.path(class_field.probability)
+                share = self._found.levels[list_level(share_path)].numbers[share_path]
+                share = share[ancestor_rows(self._found, level, list_level(share_path))]
                 # A class with probability 0 or none is still stated; more than 1 counts as 1.
                 share = sift_shares(share, "class share", self._notes, most=MOST_SHARE)
                 share = np.clip(np.where(np.isnan(share), 0.0, share), 1e-9, 1.0)
             counted = code >= 0
             if class_field.key is not None:
-                of_key = self._wanted.path(class_field.key)
-                keys = self._found.levels[list_level(of_key)].texts[of_key]
-                key = keys.code[ancestor_rows(self._found, level, list_level(of_key))]
+                key_path = self._wanted.path(class_field.key)
+                keys = self._found.levels[list_level(key_path)].texts[key_path]
+                key = keys.code[ancestor_rows(self._found, level, list_level(key_path))]
                 counted &= np.array([word.lower() in class_field.keys for word in keys.words] + [False])[key]
             owner = ancestor_rows(self._found, level, shared)
             claimed = np.zeros((self.rows(shared), len(CLASSES)))
@@ -457,20 +458,20 @@ class _BatchReader:
         return is_meant
 
     def _ids(self) -> DistinctTexts | None:
-        """(P,) ids; None: objects have none."""
+        """(P,) ids as texts, made unique by the field `within`; None: no object has one."""
         if self._fields.id is None:
             return None
         ids = self.text(self._fields.id)
-        nothing = np.array([not word for word in ids.words] + [True])[ids.code]  # an empty text is no id
-        if nothing.all():
+        is_empty = np.array([not word for word in ids.words] + [True])[ids.code]  # an empty text is no id
+        if is_empty.all():
             return None
-        ids = DistinctTexts(np.where(nothing, -1, ids.code), ids.words)
+        ids = DistinctTexts(np.where(is_empty, -1, ids.code), ids.words)
         if self._description.within is None:
             return ids
-        spaces = self.text(self._description.within)
-        width = len(ids.words) + 1
-        pairs, code = np.unique((spaces.code + 1) * width + ids.code + 1, return_inverse=True)
-        names = tuple(_join_id(spaces, pair // width - 1, ids, pair % width - 1) for pair in pairs.tolist())
+        name_spaces = self.text(self._description.within)
+        id_count = len(ids.words) + 1
+        pairs, code = np.unique((name_spaces.code + 1) * id_count + ids.code + 1, return_inverse=True)
+        names = tuple(_join_id(name_spaces, pair // id_count - 1, ids, pair % id_count - 1) for pair in pairs.tolist())
         return DistinctTexts(np.where(ids.code < 0, -1, code), names)
 
     def _said(self, what: Literal["yaw", "velocity", "covariance"]) -> Bool:
@@ -502,7 +503,7 @@ class _BatchReader:
         return np.where(stated, vx, np.nan), np.where(stated, vy, np.nan)
 
     def _values(self) -> Float:
-        """(P, V) values of the objects, in the order of VALUES."""
+        """(P, V) values of the objects, in the order of VALUES; NaN: not stated."""
         fields, yaw = self._fields, self._yaw()
         return np.stack(
             [
@@ -549,7 +550,7 @@ class _BatchReader:
     def _with_standing(
         self, keep: Int, message: Int, ids: DistinctTexts | None, in_time: Int, values: Float
     ) -> tuple[Int, Int]:
-        """Rows of objects and the message of each, with what stands in those of `in_time` that do not repeat it."""
+        """Rows of objects and the message of each, with what stands added to messages that do not repeat it."""
         stays, paths, entry_message = self._description.stays, self._wanted.lifetime, message[keep]
         if stays is None or ids is None or not len(keep):
             return keep, entry_message
@@ -571,7 +572,7 @@ class _BatchReader:
         return keep[order], entry_message[order]
 
     def _removals(self, ids: DistinctTexts) -> tuple[Int, Int]:
-        """Things that messages remove, −1: all, and the message of each removal."""
+        """Things that messages remove (code of the id, −1: all), and the message of each removal."""
         stays = self._description.stays
         if stays is None or not self._wanted.removal:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -581,13 +582,13 @@ class _BatchReader:
         one, every = (np.array([word in of for word in kinds])[texts[stays.kind].code] for of in (stays.one, stays.all))
         code = ids.code
         if stays.id is not None:
-            known = {word: number for number, word in enumerate(ids.words)}
-            code = np.array([*(known.get(word, -2) for word in texts[stays.id].words), -2])[texts[stays.id].code]
+            code_by_id = {word: number for number, word in enumerate(ids.words)}
+            code = np.array([*(code_by_id.get(word, -2) for word in texts[stays.id].words), -2])[texts[stays.id].code]
         chosen = every | (one & (code >= 0))
         return np.where(every, -1, code)[chosen], message[chosen]
 
     def listed(self, log_time_ns: Int, ahead_ns: int, since_ns: int) -> DecodedLists:
-        """The columns of the objects that are kept. The order of the steps is that of the notes."""
+        """The objects that are kept, from `since_ns` on. The order of the steps is that of the notes."""
         shredded, is_meant = self._found, self._meant()
         self._notes += find("undecoded", int((~shredded.decoded).sum()))
         kept_message, stamp_ns, stamped = self._settled_stamps(log_time_ns, ahead_ns)
@@ -600,8 +601,8 @@ class _BatchReader:
         keep, message = self._with_standing(
             keep, message, ids, kept_message[np.argsort(stamp_ns, kind="stable")], values
         )
-        late = log_time_ns[kept_message] >= since_ns
-        kept_message, stamp_ns, stamped = kept_message[late], stamp_ns[late], stamped[late]
+        is_inside = log_time_ns[kept_message] >= since_ns
+        kept_message, stamp_ns, stamped = kept_message[is_inside], stamp_ns[is_inside], stamped[is_inside]
         keep, message = (rows[np.isin(message, kept_message)] for rows in (keep, message))
         number = np.arange(len(keep)) if ids is None else ids.code[keep]
         names = tuple(str(k) for k in range(len(keep))) if ids is None else ids.words

@@ -119,9 +119,8 @@ class GroundTruthDecoder:
         self._messages = 0
 
     def add(self, payload: bytes, *, schema: str, log_time_ns: int, ahead_ns: int = 0) -> None:
-        """Add a message of `schema`, one of `TRUTH_SCHEMAS`; one that cannot be decoded is skipped with a note.
-
-        `ahead_ns`: how far the clock of its stamp is ahead of that of the log times. Raises OversizeError.
+        """Add a message of `schema` (one of `TRUTH_SCHEMAS`); one that cannot be decoded gives only a note. `ahead_ns`:
+        how far the clock of its stamp is ahead of that of the log times. Raises OversizeError.
         """
         message_class = self._message_of[schema]
         self._messages += 1
@@ -158,10 +157,7 @@ class GroundTruthDecoder:
         self._allowance.spend(0, self._rows[-1])
 
     def add_earlier(self, payload: bytes, schema: str) -> None:
-        """Take what stays of a message before those that are read: its road, its place on earth, what stands.
-
-        Raises OversizeError.
-        """
+        """Take what stays of a message before those that are read: road, place, what stands. Raises OversizeError."""
         check_osi(self._message_of[schema], payload)
         with suppress(DecodeError):
             message = self._message_of[schema].FromString(payload)
@@ -229,7 +225,7 @@ class GroundTruthDecoder:
             self._place = place._replace(changed=changed)
 
     def _add_moving(self, objects: Any) -> None:
-        """Add a row for each. Reading fields costs most: each is read once, its presence only where it is 0."""
+        """Add a row for each moving object. Speed: each field is read once, its presence only where it is 0."""
         number_of, next_number = self._moving_number, self._next_number
         add_object, add_class, add_values = self._object_ix.append, self._class_ix.append, self._values.extend
         for k, moving in enumerate(objects):
@@ -256,8 +252,7 @@ class GroundTruthDecoder:
             add_values((x, y, z, yaw, vx, vy, size.length, size.width, size.height))
 
     def _add_stationary(self, objects: Any) -> None:
-        """Add a row of class `other`, at rest, for each that stands; those with a base polygon become solids.
-
+        """Add a row of class `other`, at rest, for each stationary object; those with a base polygon become solids.
         Many writers send them once. They stay until a message that repeats some of them leaves them out.
         """
         self._find_standing(objects)
@@ -269,7 +264,7 @@ class GroundTruthDecoder:
             self._values.extend(values)
 
     def _find_standing(self, objects: Any, *, report: bool = True) -> None:
-        """Take the stationary objects of a message, with findings if they are `report`."""
+        """Update which stationary objects stand, by those of a message; `report`: notes on what is odd."""
         sent: dict[int, tuple[float, ...]] = {}
         for k, stationary in enumerate(objects):
             place, rules = (self._messages, 1, k), list[str]()
@@ -289,10 +284,10 @@ class GroundTruthDecoder:
                     sent.setdefault(ident, (*state, 0.0, 0.0, size.length, size.width, size.height))
             for rule in rules if report else ():
                 self._note(rule, place)
-        lasting = len(self._standing.keys() - sent.keys())
+        not_repeated = len(self._standing.keys() - sent.keys())
         if self._standing.keys().isdisjoint(sent):
-            if lasting and report:
-                self._note("stands", (self._messages, 1, 0), lasting)
+            if not_repeated and report:
+                self._note("stands", (self._messages, 1, 0), not_repeated)
             sent = self._standing | sent
         self._standing = sent
 
@@ -313,8 +308,8 @@ class GroundTruthDecoder:
             (position.x + cos * p.x - sin * p.y, position.y + sin * p.x + cos * p.y) for p in base.base_polygon
         )
         corners = corners[:-1] if corners[0] == corners[-1] else corners
-        somewhere = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
-        outline = shapely.Polygon(corners) if somewhere and 3 <= len(corners) <= _MOST_CORNERS else None
+        is_near = all(abs(value) <= FARTHEST_M for value in (*itertools.chain(*corners), position.z))
+        outline = shapely.Polygon(corners) if is_near and 3 <= len(corners) <= _MOST_CORNERS else None
         if outline is None or not outline.is_valid or not outline.area > 0.0:
             self._note("polygon", place)
             return None

@@ -75,7 +75,7 @@ def _read_points(points: Iterable[Any]) -> Float:
 
 
 def _read_lane(lane: Any, boundaries: Mapping[int, Float]) -> list[Lane]:
-    """A lane by its boundaries in the direction in which it is driven; none where it lacks one."""
+    """The lane as a list of one, in the direction in which it is driven; empty: a boundary is missing."""
     classification = lane.classification
     kind = _KINDS.get(classification.subtype, "other") if classification.subtype > 1 else "driving"
     if classification.type != DRIVING and kind == "driving":
@@ -110,7 +110,7 @@ def _join_along(parts: Sequence[Float], centre_m: Float) -> Float:
 
 
 def _read_logical_lane(lane: Any, boundaries: Mapping[int, Float]) -> list[Lane]:
-    """A logical lane, twice where it is driven both ways; none where it lacks a border."""
+    """The lane as a list, of two where it is driven both ways; empty: a border is missing."""
     left, right = (
         _join_along(
             [_cut(boundaries[i.value], lane.start_s, lane.end_s) for i in ids if i.value in boundaries], _NOWHERE
@@ -119,10 +119,10 @@ def _read_logical_lane(lane: Any, boundaries: Mapping[int, Float]) -> list[Lane]
     )
     if min(len(left), len(right)) < 2:
         return []
-    found = Lane(str(lane.id.value), _KINDS.get(lane.type, "other"), left, right)
+    lane_as_listed = Lane(str(lane.id.value), _KINDS.get(lane.type, "other"), left, right)
     if lane.move_direction == INCREASING:
-        return [found]
-    return [found.turned()] if lane.move_direction == DECREASING else [found, found.turned()]
+        return [lane_as_listed]
+    return [lane_as_listed.turned()] if lane.move_direction == DECREASING else [lane_as_listed, lane_as_listed.turned()]
 
 
 def _cut(points: Float, start_s: float, end_s: float) -> Float:
@@ -136,7 +136,7 @@ def _cut(points: Float, start_s: float, end_s: float) -> Float:
 
 
 def _add_crosswalks(road: OsiRoad, markings: Iterable[Any]) -> None:
-    """Add crosswalks as areas, with their outlines as lines."""
+    """Add crosswalks to the road: as areas, with their outlines as lines."""
     no_extent = 0
     for marking in markings:
         if marking.classification.traffic_main_sign_type != ZEBRA or marking.classification.is_out_of_service:
@@ -153,9 +153,8 @@ def _add_crosswalks(road: OsiRoad, markings: Iterable[Any]) -> None:
 
 
 def _list_outlines(base: Any) -> Iterator[Float]:
-    """What covers ground of the base polygon and the box of a marking, seen from above: corners (K, 2) of each.
-
-    The frame of a marking has x up and z along it in OSI, but many leave it level: the box is turned as a whole.
+    """What a marking covers, seen from above: corners (K, 2) of its base polygon, and of its box. The frame of a
+    marking has x up and z along it in OSI, but many leave it level: the box is turned as a whole.
     """
     import shapely
 
@@ -165,10 +164,10 @@ def _list_outlines(base: Any) -> Iterator[Float]:
                      [cy * sp * cr + sy * sr, sy * sp * cr - cy * sr]])  # fmt: skip
     polygon = np.array([(p.x, p.y, 0.0) for p in base.base_polygon]).reshape(-1, 3)
     box = np.array(np.meshgrid(*([-v / 2, v / 2] for v in (size.length, size.width, size.height)))).reshape(3, -1).T
-    for corners, hull in ((polygon, False), (box, True)):
+    for corners, is_box in ((polygon, False), (box, True)):
         ring = np.round(corners @ axes + [at.x, at.y], 6)  # to µm: a level box has its lower corners under the upper
         if not (len(ring) > 2 and (np.abs(ring) <= FARTHEST_M).all() and abs(at.z) <= FARTHEST_M):
             continue
-        outline = shapely.MultiPoint(ring).convex_hull if hull else shapely.Polygon(ring)
+        outline = shapely.MultiPoint(ring).convex_hull if is_box else shapely.Polygon(ring)
         if outline.geom_type == "Polygon" and outline.area > 0.0:
             yield np.array(outline.exterior.coords)[:-1]

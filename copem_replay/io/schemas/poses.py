@@ -143,7 +143,7 @@ def decode_poses(channel: Channel, payloads: Sequence[bytes], log_time_ns: Int) 
 def _settle_each(
     stamp_ns: Int, stamped: Bool, log_time_ns: Int, frame: Int, ahead_ns: int
 ) -> tuple[Int, Iterator[Finding]]:
-    """The stamps (K,) of the poses, of each frame (K,) by themselves: transforms are stamped by who sends them."""
+    """The stamps (K,) of the poses, settled frame by frame (each has its own sender), and findings."""
     settled_ns, counts = stamp_ns.copy(), Counter[str]()
     for number in np.unique(frame):
         rows = np.flatnonzero(frame == number)

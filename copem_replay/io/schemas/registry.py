@@ -41,10 +41,7 @@ class ListSchema:
     stays: bool = False
 
     def description(self, offers: Collection[str]) -> Description:
-        """The description of messages that offer these paths.
-
-        Raises InputError: the function of another package cannot be imported, fails or gives something else.
-        """
+        """The description of messages with these paths. Raises InputError: another package's function fails."""
         from copem_replay.io.schemas.description import Description
 
         module, _, name = self.describe.partition(":")
@@ -129,7 +126,7 @@ def describe_channel(channel: Channel, offers: Collection[str]) -> Description:
 
 @cache
 def _load_installed(name: str) -> ListSchema | None:
-    """The row of another package for a schema; None: no package has one. Raises InputError."""
+    """The row of another package for a schema; None: no package has one. Raises InputError: it cannot be loaded."""
     from importlib.metadata import entry_points  # takes time, and few recordings have schemas that no row names
 
     entry = next(iter(entry_points(group=GROUP, name=name)), None)

@@ -35,7 +35,7 @@ def _scale(per: float, *none: float, flagged: bool = True) -> Callable[..., Floa
 def _describe(
     objects: str, ident: str, within: str, class_: str, names: dict[int, str], share: str | None, made: dict[str, Made]
 ) -> Description:
-    """The description of lists whose columns `made` has, with one path of the confidence along each axis."""
+    """The description of lists: `made` has each column with the paths it is made of; `share`: path of probability."""
     columns = ("x_m", "y_m", "yaw_rad", "length_m", "width_m", "height_m", "vx_mps", "vy_mps", "covariance")
     kind = ClassField(path=class_, map={str(number): name for number, name in names.items()}, probability=share)
     fields = {"objects": objects, "stamp": Stamp(path="stamp_ms", unit="ms"), "id": ident, "class": kind}
@@ -253,8 +253,8 @@ def _describe_sdsm(
     per_deg: float, per_s: float, per_m: float, per_mps: float, per_turn: float, per_side: float, per_height: float,
     *flags: str,
 ) -> Description:  # fmt: skip
-    """The description of messages with so many units for a degree of the place, an s, an m, an m/s, a degree of the
-    heading, an m of the side of a vehicle and of its height.
+    """The description of SDSM. `per_…`: units in a degree (place), s, m, m/s, degree (heading), m of a vehicle's side,
+    of its height; `flags`: further paths of heading and speed.
 
     Offsets are north and east of the station, as CARMA reads them. A measurement is before its message, whatever the
     sign of its time: writers differ.

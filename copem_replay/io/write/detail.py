@@ -87,7 +87,7 @@ class Statuses:
         self._names = TextPool.of([scene.object_ids[number] for number in known_ns])
 
     def at(self, available_ns: Int) -> RepeatedMessages:
-        """The status of each object, and the age of its entry in s, NaN: none; of each list."""
+        """For each list, available at `available_ns`: the status of each object, and its entry's age (s; NaN: none)."""
         rows, bounds = self._fused_tracks.listed_rows
         frame, number = np.repeat(np.arange(len(available_ns)), np.diff(bounds)), self._fused_tracks.fused.row_object_ix
         available_s = (available_ns - self._t0_ns) * 1e-9
@@ -228,7 +228,7 @@ class DetailWriter:
         self._sizes_of = np.zeros(len(self._name), dtype=bool) if sizes_of is None else sizes_of
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        """The lists as they became available at these instants of the log's clock, (F,)."""
+        """The `…/detail` messages of the lists, available at these instants (F,) of the log's clock (ns)."""
         rows, bounds = self._fused_tracks.listed_rows
         for first, last in split_into_blocks(bounds):
             objects = self._objects(rows[bounds[first] : bounds[last]])
@@ -241,7 +241,7 @@ class DetailWriter:
                 yield message[:-1] + self._besides(frame)
 
     def _objects(self, rows: Int) -> JsonContent:
-        """The objects of some rows."""
+        """The objects of some rows as content of JSON."""
         fused, claims, stated_s = self._fused_tracks.fused, self._fused_tracks.said, self._fused_tracks.stated_s
         sized = self._sizes_of[rows]
         sides = {n: StatedRows(sized, getattr(fused, n)[0, rows[sized]], null=False) for n in ("length_m", "width_m")}
@@ -296,8 +296,7 @@ class ReadyLists:
     has_ids: bool
 
     def draw_areas(self, first: int, last: int) -> RepeatedMessages:
-        """The field of view in the world at some lists, as polygons of osi3.SensorData.VirtualDetectionArea.
-
+        """The field of view in the world at lists first … last − 1, as osi3.SensorData.VirtualDetectionArea polygons.
         Places are rounded to 1/64 m: the other digits are most of what compression leaves of a field that moves.
         """
         x, y, z, heading = self.poses[:, first:last, None]
@@ -321,17 +320,17 @@ class UnitDetailWriter:
         self._stamp = partial(_state_instants, scene.t0_ns)
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        """The lists as they were ready at these instants of the log's clock, (F,)."""
+        """The `…/detail` messages of a unit's lists, ready at these instants (F,) of the log's clock (ns)."""
         unit, fused = self._unit, self._unit.lists.fused
         bounds, true_ns = fused.by_frame[1], unit.true_captured_ns
         for first, last in split_into_blocks(bounds):
             rows, lists = slice(bounds[first], bounds[last]), slice(first, last)
-            known = fused.row_object_ix[rows] >= 0
-            names = self._names.at(fused.row_object_ix[rows][known])
-            beside = {name: of[rows] for name, of in self._beside.items()}
+            has_id = fused.row_object_ix[rows] >= 0
+            names = self._names.at(fused.row_object_ix[rows][has_id])
+            other_columns = {name: of[rows] for name, of in self._beside.items()}
             objects = {
-                "id": StatedRows(known, names),
-                **{name: StatedRows(of != 0, of[of != 0], null=False) for name, of in beside.items()},
+                "id": StatedRows(has_id, names),
+                **{name: StatedRows(of != 0, of[of != 0], null=False) for name, of in other_columns.items()},
             }
             content: JsonContent = {
                 "available_ns": available_ns[lists],

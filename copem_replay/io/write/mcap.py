@@ -166,7 +166,7 @@ def _encode_chunk(
     colours: Mapping[str, Rgb],
     run_chunk: RunLists,
 ) -> Iterator[TimedMessages]:
-    """The messages of one time chunk: the lists of all configurations, what is beside them, then the units' lists."""
+    """The messages of a time chunk: the lists of configurations, what is beside them, then units' lists."""
     chunk, unit_lists = run_chunk
     for name, fused_tracks in chunk.items():
         events = _find_events(fused_tracks.fused, tables[name])
@@ -179,7 +179,7 @@ def _encode_chunk(
 
 
 def _encode_truth(writer: TruthWriter, truth: TruthScene) -> Iterator[Message]:
-    """The messages of the truth's scene; static entities once, at the start."""
+    """The messages of the truth's scene: static entities once, then frame by frame what moves."""
     frame, encode = 0, writer.encode_transforms
     for part in truth.moving:
         poses = truth.followed[frame : frame + len(part.time_ns)]
@@ -251,16 +251,16 @@ def _encode_lists(scene: Scene, fused: Tracks, writers: Mapping[int, ListWriter]
 
 
 def _find_events(fused: Tracks, table: pd.DataFrame) -> dict[int, list[Event]]:
-    """The detections by the index of the list that was available at their instant."""
+    """The detections by the index of the list that was available at their instant (other chunks: none)."""
     events: dict[int, list[Event]] = {}
     issue_s, tolerance_s = fused.common_arrives_s, 2 * SAME_INSTANT_S
     if not len(issue_s):
         return events
     # Detections outside are those of other time chunks.
-    here = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
-    for row in table.loc[table["detected"] & here, ["object_id", "first_unit", "detection_s", *_EVENT_TIMES]].to_dict(
-        "records"
-    ):
+    is_in_chunk = table["detection_s"].between(issue_s[0] - tolerance_s, issue_s[-1] + tolerance_s)
+    for row in table.loc[
+        table["detected"] & is_in_chunk, ["object_id", "first_unit", "detection_s", *_EVENT_TIMES]
+    ].to_dict("records"):
         frame = int(np.abs(issue_s - row["detection_s"]).argmin())
         times = {name: None if np.isnan(row[name]) else float(row[name]) for name in _EVENT_TIMES}
         events.setdefault(frame, []).append({"object": row["object_id"], "first_unit": row["first_unit"], **times})
@@ -309,13 +309,13 @@ class BatchWriter(Writer):
     """
 
     def add_messages(self, messages: Iterable[Message]) -> None:
-        """Add messages as `add_message` does one by one."""
+        """Add messages, with the same bytes as `add_message` one by one, but faster."""
         batch: list[Message] = []
-        offset, most = self._chunk.count, vars(self)["_Writer__chunk_size"]
+        offset, chunk_size = self._chunk.count, vars(self)["_Writer__chunk_size"]
         for message in messages:
             batch.append(message)
             offset += _MESSAGE_HEAD.size + len(message.data)
-            if offset > most:
+            if offset > chunk_size:
                 self._fill_chunk(batch)
                 batch, offset = [], 0
         if batch:
@@ -327,7 +327,7 @@ class BatchWriter(Writer):
         return chunk
 
     def _fill_chunk(self, messages: Sequence[Message]) -> None:
-        """Add messages of which all but the last fit into the chunk."""
+        """Add messages of which all but the last fit into the chunk, and close it if it is full."""
         chunk, parts = self._chunk, list[bytes]()
         offset = chunk.count
         for m in messages:

@@ -123,6 +123,7 @@ def write_osi_trace(trace: OsiTrace, path: Path) -> None:
 
 
 def _write_content(writer: Writer, trace: OsiTrace) -> None:
+    """Write metadata, channels and messages of an OSI trace, in an order and with bytes that do not vary."""
     osi_version = osi3.__version__
     trace_metadata = {
         **dict.fromkeys(("version", "min_osi_version", "max_osi_version"), osi_version),
@@ -192,7 +193,7 @@ class SensorDataWriter:
             self._used_start = np.concatenate([[0], np.cumsum(has_unit)])
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        """The lists as they became available at these instants of the log's clock, (F,)."""
+        """The lists as osi3.SensorData, available at these instants (F,) of the log's clock (ns)."""
         rows, bounds = self._fused_tracks.listed_rows
         version = dict(
             zip(("version_major", "version_minor", "version_patch"), map(int, OSI_VERSION.split(".")), strict=True)
@@ -220,7 +221,7 @@ class SensorDataWriter:
             yield from encode_messages(load_message_class(SENSOR_DATA).DESCRIPTOR, content, last - first)
 
     def _items(self, rows: Int, captured_ns: Int, moving: bool) -> Content:
-        """The content of detected objects; `captured_ns`: the newest capture of their lists."""
+        """The content of detected objects (`moving` or stationary); `captured_ns`: the newest capture of their list."""
         fused = self._fused_tracks.fused
         x, y, z, length, width, height, yaw, vx, vy = (
             getattr(fused, name)[0, rows]
@@ -248,6 +249,7 @@ class SensorDataWriter:
         }
 
     def _header(self, rows: Int, captured_ns: Int) -> Content:
+        """The headers of detected objects; *measured* are those with an entry of the newest capture, `captured_ns`."""
         claims, object_ix = self._fused_tracks.said, self._fused_tracks.fused.row_object_ix[rows]
         true_id = self._ids[object_ix[object_ix >= 0]]
         track_id = None if claims is None else claims["track_id"][rows]

@@ -49,7 +49,7 @@ class ObjectsWriter:
         self._frame_id, self._tracked = frame_id, tracked
 
     def messages(self, available_ns: Int) -> Iterator[bytes]:
-        """The lists as they became available at these instants of the log's clock, (F,)."""
+        """The lists as DetectedObjects or TrackedObjects, available at these instants (F,) of the log's clock."""
         rows, bounds = self._rows
         for first, last in split_into_blocks(bounds):
             objects = self._objects(rows[bounds[first] : bounds[last]])
@@ -64,6 +64,7 @@ class ObjectsWriter:
             yield from encode_cdr(TRACKED_OBJECTS if self._tracked else DETECTED_OBJECTS, content, last - first)
 
     def _objects(self, rows: Int) -> Content:
+        """The content of detected or tracked objects in some rows; pedestrians and the like are cylinders."""
         fused, cylinder = self._fused, self.round[rows]
         length, width, height = (getattr(fused, name)[0, rows] for name in ("length_m", "width_m", "height_m"))
         across = (length + width) / 2
@@ -83,7 +84,7 @@ class ObjectsWriter:
         return np.concatenate([np.zeros_like(ids), ids], axis=1)
 
     def _classes(self, rows: Int) -> RepeatedMessages:
-        """The label of the true class, or the probability of each label, by the first of its classes."""
+        """The label of the true class, or the probability of each label: the sum over its classes."""
         if self._said is None:
             return RepeatedMessages(
                 np.arange(len(rows) + 1), {"label": _LABEL[self._class_ix[rows]], "probability": 1.0}
@@ -98,6 +99,7 @@ class ObjectsWriter:
         return RepeatedMessages(start_offsets((lead >= 0).sum(axis=1)), labels)
 
     def _kinematics(self, rows: Int) -> Content:
+        """Pose, twist (along the object) and covariances of some rows as content of the message."""
         fused, moving = self._fused, self._moving[rows]
         x, y, z, yaw = (getattr(fused, name)[0, rows] for name in ("x_m", "y_m", "z_m", "yaw_rad"))
         cos, sin = np.cos(yaw), np.sin(yaw)

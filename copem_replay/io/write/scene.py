@@ -162,10 +162,11 @@ class UncertaintyWriter:
             yield from self._draw(time_ns, start, self._ellipses(rows[bounds[first] : bounds[last]], available_s))
 
     def _ellipses(self, rows: Int, available_s: Float) -> Content:
+        """Discs that show the uncertainty of entries, paler with age, as content of foxglove.SceneUpdate."""
         fused = self._fused_tracks.fused
         age_s = np.fmax(0.0, available_s - self._fused_tracks.captured_s[0, rows])
-        known = np.isfinite(age_s)
-        ages = TextPool.of([f"{age:.3f}" for age in age_s[known].tolist()])
+        has_age = np.isfinite(age_s)
+        ages = TextPool.of([f"{age:.3f}" for age in age_s[has_age].tolist()])
         x, y, z, height = (getattr(fused, name)[0, rows] for name in ("x_m", "y_m", "z_m", "height_m"))
         alpha = FRESH_ALPHA + (OLDEST_ALPHA - FRESH_ALPHA) * np.minimum(age_s / FADES_S, 1.0)
         cylinder: Content = {
@@ -178,7 +179,7 @@ class UncertaintyWriter:
         return {
             "id": self._names.at(self._name[rows]),
             "metadata": optional_message(
-                known, {"key": repeat_text(b"age_s", int(known.sum())), "value": ages.at(np.arange(known.sum()))}
+                has_age, {"key": repeat_text(b"age_s", int(has_age.sum())), "value": ages.at(np.arange(has_age.sum()))}
             ),
             "cylinders": RepeatedMessages(np.arange(len(rows) + 1), cylinder),
         }
@@ -302,16 +303,16 @@ class _Looks:
         self._words = TextPool.of([text.text for text in self._texts])
 
     def content(self, moving: MovingEntities, rows: slice) -> Content:
-        """The entities of some rows (P,)."""
+        """The entities of some rows (P,) as content of foxglove.SceneUpdate."""
         look = moving.look_ix[rows]
         (lines, line, of_line), (texts, text, of_text), (ellipses, ellipse, of_ellipse) = (
             self._list_elements(kind, look) for kind in _ELEMENTS
         )
         columns = [getattr(moving, name)[rows] for name in ("x_m", "y_m", "z_m", "yaw_rad")]
-        above = _column([each.above_m for each in self._texts])
+        above_m = _column([each.above_m for each in self._texts])
         x, y, z, _ = (column[of_text] for column in columns)
-        for step in range(above.shape[1]):
-            z = z + above[text, step]
+        for step in range(above_m.shape[1]):
+            z = z + above_m[text, step]
         size = _column([each.size for each in self._ellipses])
         return {
             "id": self._names.at(look),

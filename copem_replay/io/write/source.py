@@ -94,10 +94,7 @@ class RecordingSource:
         self.channels = dict(_list_channels(opened))
 
     def register(self, catalogue: Catalogue, left_out: Collection[str] = ()) -> dict[int, int]:
-        """Put schemas, channels and attachments into the output, except the topics `left_out`.
-
-        Returns the new number of each channel by its number here.
-        """
+        """Put schemas, channels and attachments into the output, but topics `left_out`. Returns new numbers by old."""
         numbers: dict[int, int] = {}
         for number, c in self.channels.items():
             if c.topic not in left_out:
@@ -137,7 +134,7 @@ def _list_files(log: Log) -> Iterator[Log]:
 
 
 def _read_records(log: Log) -> list[McapRecord]:
-    """The header, the metadata records and the attachments of a file. Raises BrokenIndexError."""
+    """The header, metadata and attachments of a file; none of other formats than MCAP. Raises BrokenIndexError."""
     if isinstance(log, TraceLog | SqliteLog):
         return []
     with open_file(log.path) as file:
@@ -162,7 +159,7 @@ def _find_profile(records: list[McapRecord]) -> str:
 
 
 def _list_channels(log: Log) -> Iterator[tuple[int, Channel]]:
-    """Each channel by its number in the log: with the topic in its own file, and the metadata of the copy."""
+    """Number in the log and channel, with the topic of its own file and the metadata of the copy."""
     if isinstance(log, JoinedLog):
         joint = {channel.number: channel for channel in log.channels}
         for part in log.parts:

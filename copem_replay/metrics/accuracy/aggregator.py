@@ -86,16 +86,16 @@ class Aggregator:
         self._added = 0
 
     def add(self, lists: ObjectLists, matches: Matches, now: Matches, world: Tracks) -> None:
-        """Add the next lists.
+        """Add the next lists. `matches`, `now`: of their entries at the instants these tell of, and when the lists are
+        available.
 
-        `matches`: matches at the instants the entries tell of; `now`: at the instants the lists are available. `world`:
-        the truth when lists are available, frame k for the k-th list. Raises ValueError for another number of runs, or
-        more lists than are left.
+        `world`: the truth when lists are available, frame k for the k-th list. Raises ValueError for another number of
+        runs, or more lists than are left.
         """
         runs, count = len(lists.start), lists.start.shape[1] - 1
-        left = len(self._issue_s) - self._added
-        if runs != len(self._out.by_run) or count > left:
-            expected = f"lists of {len(self._out.by_run)} runs, at most {left} of each"
+        lists_left = len(self._issue_s) - self._added
+        if runs != len(self._out.by_run) or count > lists_left:
+            expected = f"lists of {len(self._out.by_run)} runs, at most {lists_left} of each"
             raise ValueError(f"Assessment: expected {expected}; found {runs} runs of {count}")
         chunk = slice(self._added, self._added + count)
         reference = self._reference

@@ -162,7 +162,7 @@ class HeldErrors:
         self._added = self._measured = 0
 
     def add(self, lists: ObjectLists, matches: Matches) -> None:
-        """Add the next lists. `matches`: matches at the instants the entries tell of."""
+        """Add the next lists; measures the frames that hold one. `matches`: at the instants that entries tell of."""
         frames, (newest, is_held) = self._frames, self._newest
         after = self._added + lists.start.shape[1] - 1
         chunk = slice(self._measured, int(np.searchsorted(newest, after, side="left")))
@@ -213,7 +213,7 @@ def _measure_frames(
     episodes: _EpisodeFrames, reference: tuple[Float, Float, Bool], params: AccuracyParameters, out: _HeldColumns,
     targets: Targets, estimates: Estimates, room: _FrameScratch,
 ) -> None:  # fmt: skip
-    # Adds the errors at frames `first`, `first + 1`, … to `out`; `number`: the list held at each, −1: none.
+    """Fills `out` with the errors at frames `first`, `first + 1`, …; `number`: the list held at each (−1: none)."""
     reference_x_m, reference_y_m, is_placed = reference
     for q in range(len(number)):
         g, k = first + q, number[q]
@@ -242,7 +242,7 @@ def _fill_gospa(
     params: AccuracyParameters,
     out: NDArray[np.float32],
 ) -> None:
-    # Out: GOSPAᵖ of each target.
+    """Fills `out` with the GOSPA (to the power p) of each of the first `n_true` targets; `count`: of estimates."""
     if n_true > 0:
         divide_gospa(targets, n_true, estimates, count, params.cutoff_m, params.power)
         for t in range(n_true):
@@ -251,7 +251,7 @@ def _fill_gospa(
 
 @borrowing
 def _gather_present(g: int, truth: TruthByList, episodes: _EpisodeFrames, targets: Targets, room: _FrameScratch) -> int:
-    # Out: the objects that count at frame g, and those that the truth has there. Returns the number of the first.
+    """Fills `targets` with the objects that count at frame g, `room` with all that are there. Returns how many do."""
     n_true = 0
     for p in range(truth.start[g], truth.start[g + 1]):
         m = episodes.episode_of[truth.object_ix[p]]
@@ -271,7 +271,7 @@ def _add_held_entries(
     from_m: tuple[float, float], params: AccuracyParameters, targets: Targets, estimates: Estimates,
     room: _FrameScratch, out: _HeldColumns,
 ) -> int:  # fmt: skip
-    # Errors and ages of the entries of a list that is held in run s. Returns the number of entries in GOSPA.
+    """Adds errors and ages of entries of one held list of run s to `out`. Returns the number of entries in GOSPA."""
     count = 0
     for i in range(first, after):
         if matches.role[i] == GHOST:

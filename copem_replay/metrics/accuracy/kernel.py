@@ -286,16 +286,17 @@ def _gather_targets(
     k: int, issue_s: float, world: TruthByList, episodes: EpisodeLists, from_m: tuple[float, float],
     params: AccuracyParameters, room: ListScratch, targets: Targets,
 ) -> tuple[int, int]:  # fmt: skip
-    # Out: the objects whose stay includes list k, those in a gap of the truth last. Returns their number, and the
-    # number of those that are looked at.
+    """Fills `room` with the objects in whose stay list k falls, those in a gap of the truth last, and `targets` with
+    those whose onset is past. Returns the number of both.
+    """
     n = n_true = 0
     for p in range(world.start[k], world.start[k + 1]):
         m = episodes.episode_of[world.object_ix[p]]
         if m < 0 or k < episodes.first_list[m] or k >= episodes.first_list[m] + episodes.lists[m]:
             continue
-        away_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
+        distance_m = np.hypot(world.x_m[p] - from_m[0], world.y_m[p] - from_m[1])
         room.episode[n], room.row[n], room.place_of[m] = m, p, n
-        room.distance_band[n], room.target[n] = _find_band(params.distance_edges_m, away_m), -1
+        room.distance_band[n], room.target[n] = _find_band(params.distance_edges_m, distance_m), -1
         if issue_s >= episodes.onset_s[m] - SAME_INSTANT_S:
             room.target[n] = n_true
             targets.episode[n_true], targets.column[n_true] = m, episodes.column[m] + k - episodes.first_list[m]
@@ -316,7 +317,7 @@ def _add_entries(
     from_m: tuple[float, float], time_band: int, params: AccuracyParameters, room: ListScratch, targets: Targets,
     n_true: int, estimates: Estimates, out: AccuracySums,
 ) -> int:  # fmt: skip
-    # Find the matches in a list of run s and count its other entries. Returns the number of entries in GOSPA.
+    """Finds the matches in one list of run s and counts its other entries in `out`. Returns the number in GOSPA."""
     count = 0
     for i in range(first, after):
         if matches.role[i] == MATCH:
@@ -367,6 +368,7 @@ def _add_false_positive(
     s: int, x_m: float, y_m: float, existence: float, from_m: tuple[float, float], time_band: int,
     params: AccuracyParameters, targets: Targets, n_true: int, out: AccuracySums,
 ) -> None:  # fmt: skip
+    """Counts one ghost: by run, threshold, distance and time band, and at the object nearest to it."""
     out.by_run[s].ghosts += 1
     for q in range(len(params.existence_thresholds)):
         out.ghosts_at[s, q] += existence >= params.existence_thresholds[q]
@@ -375,9 +377,9 @@ def _add_false_positive(
         out.by_distance[s, distance_band].ghosts += 1
     if time_band >= 0:
         out.by_time[s, time_band].ghosts += 1
-    nearest = find_nearest_target(x_m, y_m, targets, n_true)
-    if nearest >= 0:
-        out.by_object[s, targets.episode[nearest]].ghosts += 1
+    nearest_target = find_nearest_target(x_m, y_m, targets, n_true)
+    if nearest_target >= 0:
+        out.by_object[s, targets.episode[nearest_target]].ghosts += 1
 
 
 @borrowing
@@ -411,7 +413,7 @@ def _add_object_sums(
     m: int,
     last_track: Int,
 ) -> None:
-    # The sums that only objects have.
+    """Adds a match to the sums of its object; a switch is counted where the track id is not that of `last_track[m]`."""
     sums.square_then_m2 += square_then_m2
     sums.beyond_gate += beyond
     sums.nees_square_expected += nees_square_expected
@@ -425,7 +427,7 @@ def _add_object_sums(
 
 @borrowing
 def _add_pair(records: Records, band: int, east_m: float, north_m: float, nees: float, nees_expected: float) -> None:
-    # `east_m`, `north_m` NaN: the object is not there now.
+    """Adds a match to the sums of a band (−1: none); `east_m`, `north_m`: its error, NaN: the object is absent now."""
     if band < 0:
         return
     sums = records[band]
@@ -444,7 +446,7 @@ def _add_gospa(
     gospa: NDArray[np.float32], by_object: Records, sums: Any, targets: Targets, n_true: int,
     estimates: Estimates, count: int, params: AccuracyParameters,
 ) -> None:  # fmt: skip
-    # The GOSPA of one list, divided among the objects, and its OSPA: the same pairs are the best ones for both.
+    """Adds the GOSPA of one list, divided among the objects, and its OSPA; the same pairs are best for both."""
     if n_true == 0:
         return
     sums.lists_looked += 1

@@ -43,9 +43,8 @@ def _gospa(*parts: str) -> Callable[[AccuracyTotal], float | None]:
 
 
 def _nees_limit(level: float) -> Callable[[AccuracyTotal], float | None]:
-    """The quantile at `level` of the mean of n independent samples, n rows with a pair; without a gate χ²₂ₙ / n.
-
-    It is that of the gamma distribution with the mean and variance of the mean NEES within the gate.
+    """A metric: the quantile at `level` of the mean NEES of n independent rows; without a gate that is χ²₂ₙ / n. It is
+    that of the gamma distribution with the mean and variance of the mean NEES within the gate.
     """
 
     def value(total: AccuracyTotal) -> float | None:

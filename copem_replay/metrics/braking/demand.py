@@ -65,10 +65,8 @@ class BrakingEgo:
         return driving
 
     def must_brake(self, time_s: Float, instant_ix: Int, states: Float, *, margin_m: float, share: float) -> Bool:
-        """(N,) whether the driver must brake for states (N, 8 or more) that are listed at instants `instant_ix (N,)` of
-        `time_s (K,)`; −1: at none.
-
-        Raises InputError where a driver of the user's own fails.
+        """(N,) whether the driver must brake for states (N, ≥ 8), each listed at instant `instant_ix (N,)` of `time_s
+        (K,)`; −1: at none, False. `share`: of the driver's deceleration. Raises InputError where a user's driver fails.
         """
         out = np.zeros(len(instant_ix), dtype=np.bool_)
         course = self.path.course(time_s)
@@ -87,24 +85,24 @@ class BrakingEgo:
         return out
 
     def _brake(self, speed_mps: Float, share: float) -> tuple[Float, Int]:
-        """(K, J) deceleration in each step, and (K,) how many instants it takes until an ego stands that brakes with a
-        share of it, with the first.
+        """(K, J) deceleration (m/s²) by step, and (K,) the number of steps, and one, until an ego of `speed_mps (K,)`
+        stands that brakes with a `share` of it.
         """
-        most = round(_LONGEST_S / STEP_S)
+        most_steps = round(_LONGEST_S / STEP_S)
         steps = 64
         while True:
-            steps = min(steps, most)
+            steps = min(steps, most_steps)
             end_s = STEP_S * np.arange(1, steps + 1)
             begin_s = np.maximum(end_s - STEP_S, self._reaction_s)
             taken_s = np.maximum(end_s - begin_s, 0.0)
             elapsed_s = np.where(taken_s > 0, (begin_s + end_s) / 2 - self._reaction_s, 0.0)
             grid = np.broadcast_to(elapsed_s, (len(speed_mps), steps))
             deceleration = driver_deceleration(self.driver, grid, speed_mps[:, None])
-            slower = np.cumsum(share * deceleration * taken_s, axis=1) >= speed_mps[:, None] - 1e-12
-            if slower.any(axis=1).all() or steps == most:
+            has_stopped = np.cumsum(share * deceleration * taken_s, axis=1) >= speed_mps[:, None] - 1e-12
+            if has_stopped.any(axis=1).all() or steps == most_steps:
                 break
             steps *= 2
-        instants = np.where(slower.any(axis=1), np.argmax(slower, axis=1) + 2, steps + 1)
+        instants = np.where(has_stopped.any(axis=1), np.argmax(has_stopped, axis=1) + 2, steps + 1)
         return np.ascontiguousarray(deceleration), instants
 
 
@@ -113,7 +111,7 @@ def _mark_demands(
     path: Float, size: Float, along: Float, speed: Float, deceleration: Float, instants: Int, reaction_s: float,
     row_of: Int, instant_ix: Int, states: Float, margin_m: float, share: float, poses: Float, out: Bool,
 ) -> None:  # fmt: skip
-    """Out: `out (N,)`. `row_of (K,)`: the row of `along`, `speed`, …, −1: none. `poses (K, J + 1, 3)`: scratch."""
+    """Fills `out (N,)`: must brake. `row_of (K,)`: row of `along`, …, −1: none. `poses (K, J + 1, 3)`: scratch."""
     for k in range(len(along)):
         for j in range(instants[k]):
             poses[k, j, 0], poses[k, j, 1], poses[k, j, 2] = pose_on_path(path, along[k] + speed[k] * j * STEP_S)
@@ -131,15 +129,16 @@ def _must_brake(
     path: Float, size: Float, along: float, speed: float, deceleration: Float, reaction_s: float, state: Float,
     margin_m: float, share: float, poses: Float, steps: int,
 ) -> bool:  # fmt: skip
+    """Whether the ego hits the state's box, both if it does not brake and with each part of the braking `share`."""
     dx, dy = state[X] - poses[0, 0], state[Y] - poses[0, 1]
     radii = (np.hypot(size[0], size[1]) + np.hypot(state[LENGTH], state[WIDTH])) / 2 + margin_m
     reach = (speed + np.hypot(state[VX], state[VY])) * (steps - 1) * STEP_S + radii
     if not dx * dx + dy * dy <= reach * reach:  # a place that is not known is nowhere
         return False
-    near = _distance(poses[0, 0], poses[0, 1], poses[0, 2], size, state, 0.0, radii)
-    if near <= 0.0:
+    distance_m = _distance(poses[0, 0], poses[0, 1], poses[0, 2], size, state, 0.0, radii)
+    if distance_m <= 0.0:
         return False
-    margin_m = 0.0 if near <= margin_m else margin_m
+    margin_m = 0.0 if distance_m <= margin_m else margin_m
     if not _meets_ahead(poses, steps, size, state, margin_m, radii):
         return False
     for k in range(_SHARES, 0, -1):
@@ -165,7 +164,7 @@ def _is_hit(
     path: Float, size: Float, along: float, speed: float, braking: tuple[Float, float], reaction_s: float,
     state: Float, margin_m: float, radii: float,
 ) -> bool:  # fmt: skip
-    """Whether the ego that brakes, with a share of its deceleration by step, meets the entry before it stands."""
+    """Whether the ego, `braking` with (deceleration by step, share), meets the state's box before it stands."""
     s, v = along, speed
     for j in range(len(braking[0])):
         end_s = (j + 1) * STEP_S

@@ -51,18 +51,18 @@ class Drives:
         return LimitedFigure(value, low, high, "exact")
 
     def limit_share(self, confidence: float = CONFIDENCE) -> LimitedFigure:
-        """The share of the driving time in which the driver brakes for nothing; value None: nobody drives."""
+        """The share of the driving time with needless braking, with limits; value None: nobody drives."""
         total = float(self.hours.sum())
         if not total > 0:
             return LimitedFigure(None)
         value = float(self.needless_h.sum()) / total
         if self.over is None:
             return LimitedFigure(value)
-        without = (self.needless_h.sum() - self.needless_h) / (total - self.hours)
+        share_without_drive = (self.needless_h.sum() - self.needless_h) / (total - self.hours)
         by_run = self.over == "runs"
-        unseen = None if by_run else float((self.hours**2).sum() / total)
+        unseen_h = None if by_run else float((self.hours**2).sum() / total)
         runs = len(self.hours) if by_run else 0
-        return limit_left_out(value, without, self.hours, (0.0, 1.0), confidence, unseen, runs)
+        return limit_left_out(value, share_without_drive, self.hours, (0.0, 1.0), confidence, unseen_h, runs)
 
     def limit(self, metric: str, confidence: float) -> LimitedFigure:
         """`limit_rate` or `limit_share`, by the name of the figure: `RATE` or `SHARE`."""

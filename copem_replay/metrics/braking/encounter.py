@@ -73,7 +73,7 @@ class EgoPath:
         self.size_m = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
 
     def course(self, time_s: Float, constant_from_s: float | None = None) -> Course:
-        """The course at instants (T,): as recorded, or with constant speed from `constant_from_s` on."""
+        """Where the ego is at instants (T,): as recorded, or at constant speed from `constant_from_s` (s) on."""
         if constant_from_s is not None:
             start_m, speed = (np.interp(constant_from_s, self.frame_s, v) for v in (self.frame_m, self.frame_mps))
             along = start_m + speed * (time_s - constant_from_s)
@@ -121,11 +121,11 @@ def _project_on_path(x_m: Float, y_m: Float, vertex: Int, path: Float) -> Float:
 
 @kernel
 def _choose_vertices(x_m: Float, y_m: Float, yaw_rad: Float, stride_m: float, reversal_m: float) -> tuple[Int, bool]:
-    """Indices (V,) of the places that make the path, and whether it ends in reverse.
+    """Indices (V,) of the places (x, y, yaw) that make the path, and whether it ends in reverse.
 
-    The first place, and each that is a stride away from the vertex before in the direction of travel, or a reversal
-    away against it, which turns that direction round. The last place, if ahead of the last vertex by less than a
-    stride, is a vertex instead of that: in a bend the ego heads elsewhere a decimetre before.
+    These are the first place, and each a stride ahead of the last vertex, or `reversal_m` behind it, which turns the
+    direction of travel. The last place, if less than a stride ahead, replaces the last vertex: in a bend the ego heads
+    elsewhere a decimetre before.
     """
     vertices = np.empty(len(x_m), dtype=np.int64)
     vertices[0] = 0
@@ -195,7 +195,7 @@ def _clearance_m(path: Float, size: Float, other: Float, other_size: Float, marg
 def _find_border(
     path: Float, size: Float, other: Float, other_size: Float, margin_m: float, clear: float, within: float
 ) -> float:
-    """The border, between two places of the path, one clear and one within the margin: by bisection."""
+    """The distance along the path (m) between `clear` and `within` at which the margin is reached, by bisection."""
     for _ in range(40):
         s = (clear + within) / 2
         if _clearance_m(path, size, other, other_size, margin_m, s) > 0.0:
@@ -232,9 +232,8 @@ def find_required_deceleration(
 
 @borrowing
 def _deceleration_to_reach(way_m: float, after_s: float, speed_mps: float) -> float:
-    """Constant deceleration with which the ego has gone `way_m`, g, after a time t; inf where g ≤ 0.
-
-    0 where v·t ≤ g; 2 (v·t − g) / t² where the ego still moves then; v² / 2 g where it has stopped before.
+    """The constant deceleration (m/s²) with which the ego covers at most `way_m` in `after_s`; inf: `way_m` ≤ 0. 0
+    where v·t ≤ g; 2 (v·t − g) / t² where the ego still moves then; v² / 2 g where it has stopped before.
     """
     if way_m <= 0:
         return np.inf
@@ -291,13 +290,13 @@ def find_encounters(scene: Scene, truth: Tracks, episodes: Episodes, experiment:
 def _may_meet(
     ego: EgoPath, truth: Tracks, rows: Int, onset_s: float, constant_from_s: float | None, margin_m: float
 ) -> bool:
-    """Whether an object comes near the ego's course; False only where it surely stays away. `rows`: of the object."""
+    """Whether an object (its `rows` of the truth) may come within the margin of the ego's course; False is certain."""
     # The frame before the onset stands for the onset itself, which may lie between two.
-    first = max(int(np.searchsorted(truth.row_captured_s[rows], onset_s, side="right")) - 1, 0)
-    rows = rows[first:]
+    first_row = max(int(np.searchsorted(truth.row_captured_s[rows], onset_s, side="right")) - 1, 0)
+    rows = rows[first_row:]
     course = ego.course(truth.row_captured_s[rows], constant_from_s)
-    shared = truth.row_captured_s[rows] <= course.until_s
-    rows, bound_m = rows[shared], course.bound_m[shared]
+    is_on_course = truth.row_captured_s[rows] <= course.until_s
+    rows, bound_m = rows[is_on_course], course.bound_m[is_on_course]
     if not len(rows):
         return False
     x, y = ego.locate(bound_m)
@@ -311,7 +310,7 @@ def _find_encounter(
     ego: EgoPath, truth: Tracks, rows: Int, episode_ix: int, onset_s: float, constant_from_s: float | None,
     margin_m: float,
 ) -> Encounter | None:  # fmt: skip
-    """The encounter of one episode, None where the ego, not braking, stays clear."""
+    """The encounter of one episode; None: the ego, not braking, stays farther than the margin from the object."""
     captured_s = truth.row_captured_s[rows]
     last_s = max(float(captured_s[-1]), onset_s)
     regular = onset_s + NODE_S * np.arange(int((last_s - onset_s) / NODE_S) + 1)
@@ -321,17 +320,17 @@ def _find_encounter(
     course = ego.course(time_s, constant_from_s)
     other = np.stack([states["x_m"], states["y_m"], _unwrap_angles(states["yaw_rad"])])
     other_size = np.array([truth.length_m[0, rows[0]], truth.width_m[0, rows[0]]])
-    near, touch = np.empty(1), np.empty(1)
-    find_smallest_distances(course.along_m[None], ego.path, ego.size_m, other, other_size, near, touch)
-    if not near[0] <= margin_m:
+    least_distance_m, touch = np.empty(1), np.empty(1)
+    find_smallest_distances(course.along_m[None], ego.path, ego.size_m, other, other_size, least_distance_m, touch)
+    if not least_distance_m[0] <= margin_m:
         return None
     stretch_m = np.empty((_STRETCHES, 2, len(time_s)))
     find_blocked_stretches(
         ego.path, ego.size_m, other, other_size, margin_m, float(course.bound_m[0]), course.bound_m, stretch_m
     )
-    within = ((course.along_m >= stretch_m[:, 0]) & (course.along_m <= stretch_m[:, 1])).any(axis=0)
-    spent_s = time_s[np.argmax(within)] if within.any() else np.inf
-    return Encounter(episode_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(spent_s))
+    is_within = ((course.along_m >= stretch_m[:, 0]) & (course.along_m <= stretch_m[:, 1])).any(axis=0)
+    reached_s = time_s[np.argmax(is_within)] if is_within.any() else np.inf
+    return Encounter(episode_ix, time_s, course, ego.path, ego.size_m, other, other_size, stretch_m, float(reached_s))
 
 
 def _unwrap_angles(yaw_rad: Float) -> Float:

@@ -138,7 +138,7 @@ class NeedlessBraking:
     object_id: np.ndarray
 
     def repeated(self, runs: int) -> NeedlessBraking:
-        """The braking of `runs` equal runs, from that of one."""
+        """The braking of `runs` equal runs, from that of one run; itself where it has `runs` already."""
         if len(self.brakes) == runs:
             return self
         per_run = {
@@ -175,7 +175,7 @@ class NeedlessDetector:
         self._parts: list[tuple[Int, Int, Entries, Int, Int, Int]] = []
 
     def add(self, lists: ObjectLists, matches: Matches, tells_of: TellsOf) -> None:
-        """Add the lists of a time chunk, with the matches of their entries at the instant that they tell of."""
+        """Add the lists of a time chunk, with the matches of their entries when they tell of (`tells_of`)."""
         self._tells_of = tells_of
         braking, settings = self._truth.braking, self._truth.asked
         count = lists.start.shape[1] - 1
@@ -210,7 +210,7 @@ class NeedlessDetector:
         return rows[order[first]], run_ix[order[first]]
 
     def result(self) -> NeedlessBraking:
-        """The needless braking of all lists."""
+        """The needless braking over all added lists: totals by run, and one element for each event."""
         truth, runs = self._truth, len(self._existence)
         brakes, held_s = self._confirmed(self._existence >= 0.0), self._list_lasts_s()
         lasts_s = truth.drive_between(self._issue_s, self._issue_s + held_s)
@@ -220,10 +220,10 @@ class NeedlessDetector:
         first, after = _join_events(run_ix, self._issue_s[k], lasts_s[k], truth.asked.merge_s)
         needless_s = np.add.reduceat(lasts_s[k], first) if len(first) else np.zeros(0)
         begin_run, begin_k = run_ix[first], k[first]
-        lost_mps = self._lose_speed(self._issue_s[begin_k], needless_s)
+        event_lost_mps = self._lose_speed(self._issue_s[begin_k], needless_s)
         entries, object_ix, role, class_ix = self._find_entries(begin_run, begin_k)
         speed_lost = np.zeros(runs)
-        np.maximum.at(speed_lost, begin_run, lost_mps)
+        np.maximum.at(speed_lost, begin_run, event_lost_mps)
         return NeedlessBraking(
             driving_s=truth.driving_s,
             must_brake_s=float(truth.must.sum() * _GRID_S),
@@ -235,7 +235,7 @@ class NeedlessDetector:
             run_ix=begin_run,
             begins_s=self._issue_s[begin_k],
             lasts_s=self._issue_s[k[after - 1]] + lasts_s[k[after - 1]] - self._issue_s[begin_k],
-            lost_mps=lost_mps,
+            lost_mps=event_lost_mps,
             cause=self._find_causes(entries, object_ix, role, self._issue_s[begin_k]),
             entries=entries,
             class_ix=class_ix,
@@ -302,16 +302,16 @@ class NeedlessDetector:
         return take_entries(entries, place), object_ix, role, class_ix
 
     def _find_causes(self, entries: Entries, object_ix: Int, role: Int, time_s: Float) -> np.ndarray:
-        """(E,) of `CAUSES`."""
+        """(E,) why each event's entry makes the driver brake: ghost, duplicate, late or misplaced (`CAUSES`)."""
         truth, settings = self._truth, self._truth.asked
         states, present = interpolate_states(
             truth.truth, object_ix, np.ascontiguousarray(entries["captured_s"]), t0_ns=truth.scene.t0_ns,
             max_gap_s=truth.max_gap_s,
         )  # fmt: skip
-        late = truth.braking.must_brake(
+        needed_when_captured = truth.braking.must_brake(
             time_s, np.arange(len(time_s)), _stack_states(states), margin_m=settings.wider_m, share=settings.needed_at
         )
-        is_late = late & present & (self._tells_of == "capture")
+        is_late = needed_when_captured & present & (self._tells_of == "capture")
         return np.select(
             [(role == GHOST) | (object_ix < 0), role == DUPLICATE, is_late],
             [GHOST_ENTRY, DUPLICATE_ENTRY, LATE],

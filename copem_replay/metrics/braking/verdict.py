@@ -116,7 +116,7 @@ def _drive_braking(
     time_s: Float, along_m: Float, bound_m: Float, recorded_mps: Float, begin_s: Float, begin_m: Float,
     begin_mps: Float, deceleration: Float, way: Float, speed: Float,
 ) -> None:  # fmt: skip
-    """Out: `way`, `speed (R, T)`, step by step; never faster than recorded, and never faster than before."""
+    """Fills `way` (m), `speed` (m/s), each (R, T): braking from `begin_s (R,)` on, never faster than recorded."""
     for r in range(len(begin_s)):
         s, v = begin_m[r], begin_mps[r]
         for k in range(len(time_s)):
@@ -129,9 +129,9 @@ def _drive_braking(
                 s += v * v / (2 * a) if a > 0 else 0.0
                 v = 0.0
             else:
-                then = min(v - a * dt, recorded_mps[k])
-                s += (v + then) / 2 * dt
-                v = then
+                next_mps = min(v - a * dt, recorded_mps[k])
+                s += (v + next_mps) / 2 * dt
+                v = next_mps
             way[r, k], speed[r, k] = min(s, bound_m[k]), v
 
 
@@ -196,26 +196,25 @@ def _probability_between(between_s: Float, known_s: Float, reaction: Reaction) -
 
 
 def _reaction_tails(reaction: Reaction, delay_s: Float) -> tuple[Float, Float, bool]:
-    """Probabilities (K,) of a reaction of at most, and longer than, `delay_s (K,)`; whether both are exact far out."""
-    within = np.where(delay_s > 0, 1.0, 0.0)
+    """Probabilities (K,) of a reaction within `delay_s (K,)`, and beyond; whether both are exact far out."""
+    probability_within = np.where(delay_s > 0, 1.0, 0.0)
     possible = np.isfinite(delay_s) & (delay_s >= 0)
     possible_s = delay_s[possible]
     survival = reaction_survival(reaction, possible_s)
     if survival is None:
-        within[possible] = _share_within(reaction, possible_s, -53)
-        return within, 1 - within, False
-    beyond = 1 - within
-    beyond[possible] = survival
-    within[possible] = 1 - survival
+        probability_within[possible] = _share_within(reaction, possible_s, -53)
+        return probability_within, 1 - probability_within, False
+    probability_beyond = 1 - probability_within
+    probability_beyond[possible] = survival
+    probability_within[possible] = 1 - survival
     early = np.flatnonzero(possible)[survival > 0.5]
-    within[early] = _share_within(reaction, delay_s[early], -1022)
-    return within, beyond, True
+    probability_within[early] = _share_within(reaction, delay_s[early], -1022)
+    return probability_within, probability_beyond, True
 
 
 def _share_within(reaction: Reaction, delay_s: Float, least: int) -> Float:
-    """Probability (K,) that a reaction takes at most `delay_s (K,)`, 0 below 2 to the power of `least`.
-
-    The inverse distribution is inverted: the exponent of the probability is found by bisection.
+    """Probability (K,) that a reaction takes at most `delay_s (K,)`, 0 below 2 to the power of `least`. By bisection of
+    its exponent, as only the inverse of the distribution is known.
     """
     low, high = np.full(len(delay_s), float(least)), np.zeros(len(delay_s))
     for _ in range(70 if len(delay_s) else 0):

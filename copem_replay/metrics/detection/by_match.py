@@ -115,10 +115,12 @@ def _take_in(
     s: int, rows: Int, numbers: Int, lists: MatchedLists, not_before_s: float, origins: Origins,
     confirming: Confirming, best: Float, holds: Float, turns: Int, n: int, scratch: Float, level: Float, by_list: Int,
 ) -> int:  # fmt: skip
-    # Takes in the entries about one object, list by list; `best (1,)`. Returns how many `turns` are open.
+    """Takes in the entries `rows` about one object, list by list: raises `best (1,)`, fills `level` and `by_list` by
+    entry. Returns how many `turns` hold the object; `n`: before.
+    """
     place = 0
     while place < len(rows):
-        k, standing, reached, newest = numbers[place], rows[place], best[0], -1
+        k, first_row, reached, newest = numbers[place], rows[place], best[0], -1
         while place < len(rows) and numbers[place] == k:
             i = rows[place]
             place += 1
@@ -141,8 +143,8 @@ def _take_in(
                     holds[c] = existence
                     reached = max(reached, _find_confirming_existence(holds, c, confirming, scratch))
         if reached > best[0]:
-            best[0] = level[standing] = reached
-            by_list[standing] = newest
+            best[0] = level[first_row] = reached
+            by_list[first_row] = newest
     return n
 
 
@@ -159,8 +161,9 @@ def _is_newer(holdings: Holdings, a: int, b: int) -> bool:
 def _sort_by_episode(
     s: int, lists: MatchedLists, episodes: EpisodeWindows, episode: Int, first: Int, row: Int, number: Int
 ) -> None:
-    # Out: the entries of run s that count, episode by episode and in each list by list: `row`, and `number` of the
-    # list.
+    """Fills `row` with the entries of run s that count, by episode and then by list, and `number` with their lists;
+    `first`: where each episode begins.
+    """
     start, object_ix, role, issue_s = lists.start[s], lists.object_ix, lists.role, lists.issue_s
     episode_of, until_s = episodes.episode_of, episodes.until_s
     first[:] = 0
@@ -190,8 +193,9 @@ def _sort_by_episode(
 
 @borrowing
 def _find_confirming_existence(existence: Float, turn: int, confirming: Confirming, scratch: Float) -> float:
-    # The highest existence with which `hits` of `window` consecutive turns of a group, this one among them, hold
-    # the object.
+    """The highest existence at which `hits` of `window` consecutive turns of a group, `turn` among them, hold the
+    object; −inf: fewer do. `scratch`: room for as many.
+    """
     highest, hits, window, group = -np.inf, confirming.hits, confirming.of, confirming.group
     for first in range(max(turn - window + 1, 0), turn + 1):
         n = 0
@@ -253,7 +257,7 @@ class FirstMatches:
         self._steps: list[Entries] = [np.empty(0, dtype=_STEP)]
 
     def add(self, lists: ObjectLists, matches: Matches, issue_s: Float, origins: Origins) -> None:
-        """Take in the lists that come next. `issue_s (K,)`: when each is available, ascending."""
+        """Take in the lists that come next, with their matches. `issue_s (K,)`: when each is available, ascending."""
         level, by_list = np.full(len(lists.entries), np.nan), np.full(len(lists.entries), -1)
         self._held = find_existence_levels(
             MatchedLists(lists.start, lists.entries, matches.object_ix, matches.role, issue_s), self._stays, origins,
@@ -273,22 +277,22 @@ class FirstMatches:
         self._steps.append(steps)
 
     def result(self) -> tuple[FirstDetections, DetectionSteps]:
-        """The detections of the lists so far, and their steps by existence.
+        """The first detections (S, M) of the lists so far, and each step by which the best existence rose.
 
-        Captured instant and first unit are those of the newest list that makes the detection; of a stack's output the
-        capture of its entry, and no unit.
+        Capture and unit are those of the newest list that makes the detection; of a stack's output the capture of its
+        entry, and no unit.
         """
         steps = np.concatenate(self._steps)
         # The sort is stable: within an episode the steps stay in order of time.
         steps = steps[np.lexsort((steps["episode_ix"], steps["run_ix"]))]
         run_ix, episode_ix = steps["run_ix"], steps["episode_ix"]
-        first = (np.diff(run_ix, prepend=-1) != 0) | (np.diff(episode_ix, prepend=-1) != 0)
+        is_first_step = (np.diff(run_ix, prepend=-1) != 0) | (np.diff(episode_ix, prepend=-1) != 0)
         shape = self._best.shape
         detections = FirstDetections(np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, -1))
-        cells = run_ix[first], episode_ix[first]
-        detections.detection_s[cells] = steps["detection_s"][first]
-        detections.captured_s[cells] = steps["captured_s"][first]
-        detections.first_unit_ix[cells] = steps["unit_ix"][first]
+        cells = run_ix[is_first_step], episode_ix[is_first_step]
+        detections.detection_s[cells] = steps["detection_s"][is_first_step]
+        detections.captured_s[cells] = steps["captured_s"][is_first_step]
+        detections.first_unit_ix[cells] = steps["unit_ix"][is_first_step]
         columns = (run_ix, episode_ix, steps["existence"], steps["detection_s"])
         return detections, DetectionSteps(*map(np.ascontiguousarray, columns))
 

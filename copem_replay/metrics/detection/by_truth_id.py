@@ -56,7 +56,7 @@ def detect_by_truth_id(
 def _detect_first(
     received: Tracks, episodes: Episodes, *, confirm: Confirm, count_earlier: bool, max_age_s: float
 ) -> FirstDetections:
-    """The same of episodes with one of each object at most."""
+    """The first detections (S, M) by truth id, for episodes of which each object has at most one."""
     captured_s = received.row_captured_s
     order, bounds = _group_by_episode(received, episodes)
     not_before_s = episodes.counts_from_s(count_earlier=count_earlier)
@@ -79,7 +79,7 @@ def _detect_first(
 
 
 def _group_by_episode(received: Tracks, episodes: Episodes) -> tuple[Int, Int]:
-    """Rows, episode by episode, in order of arrival and then of units; where those of each episode begin, (M + 1,)."""
+    """Rows by episode, in order of arrival and then of units; (M + 1,) where the rows of each episode begin."""
     # One place more than there are objects: index −1, no truth id, has no episode.
     episode_of = np.full(int(max(episodes.object_ix.max(initial=-1), received.object_ix.max(initial=-1))) + 2, -1)
     episode_of[episodes.object_ix] = np.arange(len(episodes.object_ix))
@@ -125,10 +125,11 @@ class _EpisodeRows(NamedTuple):
 def _find_first(
     rows: _ListedRows, unit_of_turn: Int, episodes: _EpisodeRows, hits: int, window: int, out: FirstDetections
 ) -> None:
+    """Fills `out` (S, M) with the first detection of each episode: confirmed by `hits` of `window` lists or turns."""
     valid, arrives_s, captured_s, entry_s, outdated_s, unit_ix, instant, turn = rows
     order, bounds, not_before_s, until_s = episodes
     detection_s, newest_s, first_unit_ix = out
-    holding = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
+    holding_rows = np.empty(len(order), dtype=np.int64)  # rows that hold the object, in order of arrival
     no_group = np.zeros(len(unit_of_turn), dtype=np.int64)  # instants are no more than turns
     # What holds the object bears the token of the episode and run, which spares clearing them.
     by_instant, by_turn = no_group.copy(), no_group.copy()
@@ -143,7 +144,7 @@ def _find_first(
                     break
                 if not valid[s, p] or entry_s[p] < not_before_s[m]:
                     continue
-                holding[n] = p
+                holding_rows[n] = p
                 n += 1
                 if hits > 1:
                     by_instant[instant[p]] = by_turn[turn[p]] = token
@@ -161,7 +162,7 @@ def _find_first(
                     if valid[s, q] and _is_newer(rows, q, newest):
                         newest = q
                 for j in range(n):
-                    q = holding[j]
+                    q = holding_rows[j]
                     in_use = (
                         outdated_s[q] > arrives_s[p] + SAME_INSTANT_S or arrives_s[q] > arrives_s[p] - SAME_INSTANT_S
                     )

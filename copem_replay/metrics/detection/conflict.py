@@ -50,7 +50,7 @@ class ConflictDetector:
         self._held: dict[tuple[int, int], list[Int]] = {}  # by run and episode: numbers of the lists that imply one
 
     def add(self, fused_tracks: FusedTracks, first_run: int = 0) -> None:
-        """Add the fused tracks of runs (S,) from `first_run` on; a time chunk may come in blocks of runs."""
+        """Add the fused tracks of a time chunk in runs `first_run` … + S; notes the lists that imply a collision."""
         fused = fused_tracks.fused
         self._runs = max(self._runs, first_run + len(fused.valid))
         issue_s = fused.common_arrives_s
@@ -74,16 +74,16 @@ class ConflictDetector:
         self._lists += len(issue_s)
 
     def result(self) -> Float:
-        """(S, M) seconds at which such a list is available, S = 1 where one run stands for all; NaN: never."""
+        """(S, M) instant (s) of the list that confirms an implied collision; NaN: never. S = 1: alike in all runs."""
         issue_s = np.concatenate(self._issue_s)
         first_s = np.full((self._runs, len(self._episodes.object_ix)), np.nan)
         hits, window = self._confirm.hits, self._confirm.of
         for (s, m), parts in self._held.items():
             list_ix = np.concatenate(parts)
             # Places in `list_ix` from which `hits` lists are within `window` consecutive ones.
-            enough = np.flatnonzero(list_ix[hits - 1 :] - list_ix[: max(len(list_ix) - hits + 1, 0)] < window)
-            if len(enough):
-                first_s[s, m] = issue_s[list_ix[enough[0] + hits - 1]]
+            confirmed_at = np.flatnonzero(list_ix[hits - 1 :] - list_ix[: max(len(list_ix) - hits + 1, 0)] < window)
+            if len(confirmed_at):
+                first_s[s, m] = issue_s[list_ix[confirmed_at[0] + hits - 1]]
         return first_s
 
 
@@ -114,7 +114,7 @@ def build_corridors(ego: EgoPath, now_s: Float, conflict: Conflict) -> tuple[Flo
 
 @kernel
 def _cover_corridor(path: Float, along: Float, ahead: Float, bounds: Int, size: Float, pieces: Float) -> None:
-    """Each piece has the ego's pose halfway along it, and reaches as far as the path does along the piece."""
+    """Fills `pieces (…, 5)` (x, y, yaw, length, width) with boxes that cover the ego's way `ahead` from `along`."""
     for k in range(len(along)):
         n = bounds[k + 1] - bounds[k]
         for j in range(n):
@@ -150,6 +150,7 @@ class _Boxes(NamedTuple):
 def _mark_conflicts(
     valid: Bool, boxes: _Boxes, frame_ix: Int, pieces: Float, bounds: Int, horizon_s: float, out: Bool
 ) -> None:
+    """Sets `out (S, P)` where a box, at constant velocity, will enter a piece of the corridor within the horizon."""
     x, y, yaw, vx, vy, length, width = boxes
     for s in range(valid.shape[0]):
         for p in range(valid.shape[1]):
@@ -257,7 +258,7 @@ def _is_within_at_onset(scene: Scene, truth: Tracks, episodes: Episodes, experim
 
 
 def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes) -> Float:
-    """(M,) metres from places to the path of the ego's centre from the onset to the end of each episode."""
+    """(M,) distance (m) from places to the ego's way between the onset and the end of each episode."""
     import shapely
 
     ends_m = [np.interp(time_s, ego.frame_s, ego.frame_m) for time_s in (episodes.onset_s, episodes.ended_s)]
@@ -271,7 +272,7 @@ def _distance_to_path_m(ego: EgoPath, x_m: Float, y_m: Float, episodes: Episodes
 
 
 def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: MetricsSetup) -> Bool:
-    """(M,) whether at any frame the object, at constant velocity, would within `conflict_s` enter the corridor."""
+    """(M,) whether the object, at constant velocity, would at any frame enter the corridor within `conflict_s`."""
     condition, measure = experiment.measure.objects.within, experiment.measure
     assert condition is not None
     assert condition.conflict_s is not None
@@ -279,7 +280,7 @@ def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: 
     ego = EgoPath(scene, truth, experiment.max_gap_s)
     tracks = truth.take_tracks(np.isin(truth.object_ix, episodes.object_ix))
     implied = find_conflicts(tracks, ego, Conflict(horizon_s=condition.conflict_s, margin_m=margin_m))[0]
-    parts = []
+    kept_by_pass = []
     for _, part in episodes.passes:
         episode_of = np.full(len(scene.object_ids), -1)
         episode_of[part.object_ix] = np.arange(len(part.object_ix))
@@ -288,5 +289,5 @@ def _will_conflict(scene: Scene, truth: Tracks, episodes: Episodes, experiment: 
         during = (time_s >= part.onset_s[episode] - SAME_INSTANT_S) & (time_s <= part.ended_s[episode] + SAME_INSTANT_S)
         is_kept = np.zeros(len(part.object_ix), dtype=bool)
         is_kept[episode[during]] = True
-        parts.append(is_kept)
-    return episodes.join_passes(parts)
+        kept_by_pass.append(is_kept)
+    return episodes.join_passes(kept_by_pass)

@@ -75,17 +75,17 @@ class ExistenceScores(Frozen):
     calibrated: Flag = False
 
     def claimed(self, uniform: Float, *, of_ghosts: bool, ghosts_in_list: float) -> Float:
-        """Existence as claimed for uniforms in (0, 1) of any shape, all of real objects or all `of_ghosts`."""
-        drawn = np.interp(uniform, _NODES, _beta_quantiles(*(self.ghost if of_ghosts else self.real)))
-        drawn = np.clip(drawn, _SUREST, 1 - _SUREST)
+        """Existence, as claimed, for uniforms in (0, 1) of any shape: of ghosts, or of real objects."""
+        score = np.interp(uniform, _NODES, _beta_quantiles(*(self.ghost if of_ghosts else self.real)))
+        score = np.clip(score, _SUREST, 1 - _SUREST)
         if not self.calibrated:
-            return drawn
+            return score
         if ghosts_in_list == 0:
-            return np.full_like(drawn, 1 - _SUREST)
+            return np.full_like(score, 1 - _SUREST)
         from scipy.special import expit
 
         # One real entry to so many ghosts: the odds are 1 / ghosts_in_list before anything is drawn.
-        odds = _log_beta_density(drawn, *self.real) - _log_beta_density(drawn, *self.ghost) - np.log(ghosts_in_list)
+        odds = _log_beta_density(score, *self.real) - _log_beta_density(score, *self.ghost) - np.log(ghosts_in_list)
         claimed: Float = np.clip(expit(odds), _SUREST, 1 - _SUREST)
         return claimed
 
@@ -155,7 +155,7 @@ class Condition(Frozen):
         return all(tags.get(name) == value for name, value in (self.tags or {}).items())
 
     def holds(self, view: ViewGeometry) -> Bool:
-        """(P,) where the condition holds, whatever the tags of the log."""
+        """(P,) whether range, azimuth, class and visible share of each row meet the condition, whatever the tags."""
         result = np.ones(len(view.range_m), dtype=bool)
         if self.range_m is not None:
             result &= _is_within(view.range_m, *self.range_m)

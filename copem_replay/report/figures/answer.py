@@ -48,9 +48,8 @@ STACKED_ROW_IN = 0.44
 
 
 def answer_figure(results: Results, *, configurations: Sequence[str] | None = None, stacked: bool = False) -> Figure:
-    """Mean time to detection and share that passes, dots with 95 % intervals; the ground truth as a line.
-
-    `stacked`: the panels below each other, as narrow as a phone.
+    """Mean time to detection and share that passes, dots with 95 % intervals; the ground truth as a line. `stacked`:
+    the panels below each other, as narrow as a phone.
     """
     names = sort_soonest_first(results, find_contenders(results, configurations))
     rows = results.summary.set_index("configuration")
@@ -93,7 +92,7 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[str]]:
-    """A dot per configuration, and sentences on those without an interval."""
+    """A dot of each configuration's mean time to detection, and sentences on those without an interval."""
     rows = results.summary.set_index("configuration")
     weigh = results.experiment.measure.weigh
     clusters = find_clusters(results.known, weigh=weigh)
@@ -122,7 +121,7 @@ def _time_dots(results: Results, names: Sequence[str]) -> tuple[list[Dot], list[
         else:
             words = f"{format_two_decimals(mean_s)} {write_limits(limit.low, limit.high)}"
             dots.append(Dot(mean_s, limit.low, limit.high, words))
-    return dots, [_explain_without(reason, lacking, names) for reason, lacking in unlimited.items()]
+    return dots, [_explain_without(reason, without_interval, names) for reason, without_interval in unlimited.items()]
 
 
 def _explain_without(reason: str, lacking: Sequence[str], names: Sequence[str]) -> str:
@@ -139,6 +138,7 @@ def _choose_share(rows: pd.DataFrame, names: Sequence[str]) -> str | None:
 
 
 def _share_dot(row: Any, share: str) -> Dot:
+    """The dot of the share in column `share` of a summary row, in per cent, with its limits."""
     value, low, high = (
         None if pd.isna(row[key]) else float(row[key]) for key in (share, f"{share}_low", f"{share}_high")
     )
@@ -155,19 +155,19 @@ def _share_dot(row: Any, share: str) -> Dot:
 
 
 def _draw_truth_line(axes: Axes, values: dict[str, float], unit: str) -> None:
-    """Draw the ground truth as dashed lines with their values: an upper bound, not ranked."""
+    """Draw the ground truth as dashed lines with their values: an upper bound, not ranked. `unit`: after each value."""
     for name, value in values.items():
         if not np.isnan(value):
             axes.axvline(value, color="0.45", linewidth=0.75, linestyle=(0, (4, 2)), zorder=1, label=name)
     shown = ", ".join(
         f"{short} {format_three_digits(values[name])}{unit}" for name, short in shorten_names(list(values)).items()
     )
-    first = next(iter(values.values()), None)
-    if first is not None and not np.isnan(first):
-        place = _axes_fraction(axes, first)
+    first_value = next(iter(values.values()), None)
+    if first_value is not None and not np.isnan(first_value):
+        position = _axes_fraction(axes, first_value)
         axes.annotate(
-            shown, (first, 1), xycoords=axes.get_xaxis_transform(), xytext=(0, 2), textcoords="offset points",
-            ha="center" if 0.15 < place < 0.85 else "left" if place <= 0.15 else "right",
+            shown, (first_value, 1), xycoords=axes.get_xaxis_transform(), xytext=(0, 2), textcoords="offset points",
+            ha="center" if 0.15 < position < 0.85 else "left" if position <= 0.15 else "right",
             va="bottom", fontsize=7.5, color="0.3", annotation_clip=False,
         )  # fmt: skip
 
@@ -186,6 +186,7 @@ def _start_at_zero(axes: Axes, dots: Sequence[Dot]) -> None:
 
 
 def _note_sentences(results: Results, names: Sequence[str], rows: pd.DataFrame, *, intervals: bool) -> list[str]:
+    """The sentences below the figure: rows, intervals, how missed objects count, and what the dashed line is."""
     sentences = [describe_results(results, names)]
     if intervals:
         sentences.append(f"Lines: 95 % intervals over {describe_over(results)}")

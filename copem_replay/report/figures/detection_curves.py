@@ -147,15 +147,15 @@ def _draw_apart(
     curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance],
     limits_s: tuple[float, float], baseline: str,
 ) -> Figure:  # fmt: skip
-    """A panel per configuration but the baseline, which is in all of them."""
+    """A panel for each configuration but the baseline, which is in all of them, thicker."""
     short, others = shorten_names(list(curves)), [name for name in curves if name != baseline]
-    lines = math.ceil(len(others) / _COLUMNS)
-    figure = new_figure(8.0, 0.8 + _PANEL_IN * lines)
-    panels = figure.subplots(lines, _COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
+    panel_rows = math.ceil(len(others) / _COLUMNS)
+    figure = new_figure(8.0, 0.8 + _PANEL_IN * panel_rows)
+    panels = figure.subplots(panel_rows, _COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, name in zip(panels, others, strict=False):
         shown = [{key: of[key] for key in (baseline, name) if key in of} for of in (curves, exact)]
-        thin = {key: replace(looks[key], width_pt=2.6 if key == baseline else 1.5) for key in shown[0]}
-        _draw_lines(axes, shown[0], shown[1], looks | thin, limits_s)
+        widths = {key: replace(looks[key], width_pt=2.6 if key == baseline else 1.5) for key in shown[0]}
+        _draw_lines(axes, shown[0], shown[1], looks | widths, limits_s)
         axes.set_title(short[name], loc="left")
     for axes in panels[len(others) :]:
         axes.set_axis_off()
@@ -173,6 +173,7 @@ def _draw_lines(
     axes: Axes, curves: dict[str, DetectionCurve], exact: dict[str, DetectionCurve], looks: dict[str, Appearance],
     limits_s: tuple[float, float],
 ) -> None:  # fmt: skip
+    """Draw each curve with its band as share not yet known, and exact curves black; `limits_s`: ends of the axis."""
     numbers = {name: k for k, name in enumerate(looks)}
     for name, curve in curves.items():
         with mark_configuration(numbers[name], axes):
@@ -196,8 +197,8 @@ def _draw_together(
     axes = figure.subplots()
     numbers = {name: k for k, name in enumerate(looks)}
     _draw_lines(axes, curves, exact, looks, limits_s)
-    places = spread_labels([1 - _evaluate_share(curve, end_s) for curve in curves.values()])
-    for (name, curve), place in zip(curves.items(), places, strict=True):
+    label_places = spread_labels([1 - _evaluate_share(curve, end_s) for curve in curves.values()])
+    for (name, curve), place in zip(curves.items(), label_places, strict=True):
         with mark_configuration(numbers[name], axes):
             _draw_label(axes, short[name], looks[name], (end_s, 1 - _evaluate_share(curve, end_s)), place)
     axes.set_xlabel("Time since the object counts (s)")
@@ -272,6 +273,7 @@ def _add_caption(
     exact: bool,
     omitted: str,
 ) -> None:
+    """Add the note below the figure: rows, list rates, bands or why there are none, and what is beyond the axis."""
     bands = ""
     if over is None:
         bands = f"No bands: {explain_no_intervals(results)}"

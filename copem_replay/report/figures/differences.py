@@ -60,9 +60,7 @@ def differences_figure(
     results: Results, *, configurations: Sequence[str] | None = None, differences: Comparison | None = None
 ) -> Figure:
     """Differences to a baseline in the mean time to detection and in the share that passes, the soonest first.
-
-    `differences`: computed before; None: to the baseline of `compare`. Raises InputError
-    without any.
+    `differences`: computed before; None: to the baseline of `compare`. Raises InputError without any.
     """
     from copem_replay.results.compare import compare_folders
 
@@ -106,11 +104,12 @@ def _choose_metrics(rows: dict[tuple[str, str], Any], names: Sequence[str]) -> l
 
 
 def _make_dot(row: Any, metric: str) -> Dot:
+    """The dot of one difference, with its limits and words; without a row or a value “–”."""
     if row is None or pd.isna(row.difference):
         return Dot(None, None, None, "–")
-    times = _PANELS[metric][1]
+    factor = _PANELS[metric][1]
     value, low, high = (
-        None if pd.isna(number) else times * float(number) for number in (row.difference, row.low, row.high)
+        None if pd.isna(number) else factor * float(number) for number in (row.difference, row.low, row.high)
     )
     assert value is not None
     words = format_signed_decimals(value)
@@ -120,6 +119,7 @@ def _make_dot(row: Any, metric: str) -> Dot:
 
 
 def _centre_on_zero(axes: Axes, dots: Sequence[Dot], metric: str, baseline: str) -> None:
+    """Set the limits of the axis so that 0 is in it, draw its line, and say on which side what is better."""
     label, _, left, right = _PANELS[metric]
     ends = [end for dot in dots for end in (dot.value, dot.low, dot.high) if end is not None]
     low, high = min([0.0, *ends]), max([0.0, *ends])
@@ -138,7 +138,7 @@ def _centre_on_zero(axes: Axes, dots: Sequence[Dot], metric: str, baseline: str)
 def _explain_without(
     results: Results, rows: dict[tuple[str, str], Any], names: Sequence[str], metrics: Sequence[str]
 ) -> list[str]:
-    """A sentence with the reason if no difference has an interval."""
+    """A sentence that says why no difference has an interval; empty where one has."""
     compared = [rows[name, metric] for metric in metrics for name in names if (name, metric) in rows]
     if any(not pd.isna(row.interval_over) for row in compared):
         return []
@@ -151,6 +151,7 @@ def _explain_without(
 
 
 def _note_sentences(results: Results, comparison: Comparison, names: Sequence[str]) -> list[str]:
+    """The sentences below the figure: pairs, rows, intervals, and on how many logs each gains."""
     rows = comparison.overall
     limited = rows[(rows["metric"] == RANKED_BY) & rows["interval_over"].notna() & rows["configuration"].isin(names)]
     sentences = [

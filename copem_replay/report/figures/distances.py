@@ -77,21 +77,20 @@ class Strip:
         return bool(cell.max(initial=0) < len(self.count) and self.count[cell, kind].all())
 
     def place(self, distance_m: Float, kind: Int, before: Int) -> tuple[Float, Bool]:
-        """Places (n,) of points across the strip, −1 … 1, even within a bin; and which points (n,) are drawn.
-
-        `kind` (n,): indices into KINDS. `before`, shaped as `count`: points placed before; these points are added.
+        """Places (n,) of points across the strip, −1 … 1, even within a bin; and (n,) which are drawn. `before`, as
+        `count`: points placed before, to which these are added; `kind` (n,): indices into KINDS.
         """
         cell = _bin_distances(distance_m, self.width_m)
         ranked = np.lexsort((kind, cell))
-        new = np.diff(len(KINDS) * cell[ranked] + kind[ranked], prepend=-1) != 0
-        first = np.maximum.accumulate(np.where(new, np.arange(len(cell)), 0))
-        place = np.empty(len(cell), dtype=np.int64)
-        place[ranked] = np.arange(len(cell)) - first
-        place += (np.cumsum(self.count, axis=1) - self.count + before)[cell, kind]
+        is_first = np.diff(len(KINDS) * cell[ranked] + kind[ranked], prepend=-1) != 0
+        first = np.maximum.accumulate(np.where(is_first, np.arange(len(cell)), 0))
+        rank = np.empty(len(cell), dtype=np.int64)
+        rank[ranked] = np.arange(len(cell)) - first
+        rank += (np.cumsum(self.count, axis=1) - self.count + before)[cell, kind]
         np.add.at(before, (cell, kind), 1)
         in_bin = self.count.sum(axis=1)
-        across: Float = (2 * (place + 0.5) / in_bin[cell] - 1) * in_bin[cell] / max(in_bin.max(), 1)
-        drawn: Bool = place * np.minimum(in_bin[cell], MOST) % in_bin[cell] < MOST
+        across: Float = (2 * (rank + 0.5) / in_bin[cell] - 1) * in_bin[cell] / max(in_bin.max(), 1)
+        drawn: Bool = rank * np.minimum(in_bin[cell], MOST) % in_bin[cell] < MOST
         return across, drawn
 
 
@@ -200,14 +199,14 @@ class _Points:
 
 
 def _place_points(results: Results, strips: Mapping[tuple[str, str], Strip]) -> dict[tuple[str, str], _Points]:
-    """The points of all strips by event and configuration, placed log by log."""
+    """The points of all strips by event and configuration, placed log by log. InputError: tally and rows differ."""
     parts: dict[tuple[str, str], list[tuple[Float, Float, Int]]] = {key: [] for key in strips}
     before = {key: np.zeros_like(strip.count) for key, strip in strips.items()}
     for rows in results.each("configuration", *_COLUMNS.values(), "conflict", "braking_pass"):
         for key, strip in strips.items():
-            of_strip = rows[(rows["configuration"] == key[1]) & rows[_COLUMNS[key[0]]].notna()]
-            distance_m = of_strip[_COLUMNS[key[0]]].to_numpy(dtype=float)
-            kind = row_kinds(of_strip) if strip.judged else np.full(len(of_strip), KINDS.index(NEUTRAL))
+            strip_rows = rows[(rows["configuration"] == key[1]) & rows[_COLUMNS[key[0]]].notna()]
+            distance_m = strip_rows[_COLUMNS[key[0]]].to_numpy(dtype=float)
+            kind = row_kinds(strip_rows) if strip.judged else np.full(len(strip_rows), KINDS.index(NEUTRAL))
             if not strip.has(distance_m, kind):
                 raise InputError(
                     f"{results.place}/tally.parquet: expected the rows of detections.parquet counted, found others; "
@@ -226,7 +225,7 @@ def _draw_panel(
     count: int,
     top_m: float,
 ) -> None:
-    """Draw the strips of one event; `count`: number of all rows."""
+    """Draw the strips of one event (`count`: of all rows), and at the left how many rows never had it."""
     for k, (name, (strip, points)) in enumerate(strips.items()):
         with mark_configuration(list(looks).index(name), axes):
             _draw_points(axes, points, k, looks[name], name, count, strip.judged)
@@ -242,6 +241,7 @@ def _draw_panel(
 def _draw_points(
     axes: Axes, points: _Points, place: int, look: Appearance, name: str, count: int, judged: bool
 ) -> None:
+    """Draw the points of one strip, by verdict: passes in colour, fails as black crosses, others grey."""
     size, alpha = (14.0, 0.8) if count <= _FEW else (8.0, 0.6)
     in_colour: dict[str, Any] = {"marker": "o", "color": look.colour, "s": size}
     grey: dict[str, Any] = {"marker": "s", "color": "0.65", "s": 0.6 * size}
@@ -255,15 +255,16 @@ def _draw_points(
         if not chosen.any():
             continue
         position = points.distance_m[chosen], (place - _HALF * points.across)[chosen]
-        drawn: dict[str, Any] = {"linewidths": 0.8 if verdict == FAIL else 0, "rasterized": count > _MANY} | marker
-        if verdict == FAIL and drawn["rasterized"]:  # a picture stays black on a dark page
-            halo = {"color": "white", "linewidths": 2.4, "label": "_halo", "zorder": 1.95}
-            axes.scatter(*position, **(drawn | halo))
+        style: dict[str, Any] = {"linewidths": 0.8 if verdict == FAIL else 0, "rasterized": count > _MANY} | marker
+        if verdict == FAIL and style["rasterized"]:  # a picture stays black on a dark page
+            halo_style = {"color": "white", "linewidths": 2.4, "label": "_halo", "zorder": 1.95}
+            axes.scatter(*position, **(style | halo_style))
         label = f"{name}: {verdict}"
-        axes.scatter(*position, label=label, zorder=2, **({"alpha": alpha} | drawn))
+        axes.scatter(*position, label=label, zorder=2, **({"alpha": alpha} | style))
 
 
 def _build_strips(panels: Sequence[Axes], names: Sequence[str], detections: pd.DataFrame) -> None:
+    """Set up the rows of the panels, named at the left, and write at the right which share passes."""
     short = shorten_names(names)
     axes = panels[0]
     axes.set_yticks(range(len(names)), [short[name] for name in names])
@@ -285,6 +286,7 @@ def _build_strips(panels: Sequence[Axes], names: Sequence[str], detections: pd.D
 
 
 def _add_legend(figure: Figure, shown: Sequence[str]) -> None:
+    """Add the legend of the markers of the `shown` verdicts."""
     from matplotlib.lines import Line2D
 
     looks: dict[str, dict[str, Any]] = {

@@ -184,34 +184,35 @@ def _divide_sums(sums: Mapping[str, float]) -> dict[str, float]:
 
 
 def _sum_stages(rows: pd.DataFrame, experiment: Experiment, name: str, facts: ConfigurationFacts) -> dict[str, float]:
-    """Sums of the stages (s) over rows, with the number of rows under ""; sums of several logs can be added."""
+    """Sums (s) of each stage over detected rows, and the number of rows under ""; sums of logs can be added."""
     rows = rows[rows["detected"].astype(bool) & rows["captured_s"].notna()]
     if not len(rows):
         return {}
     onset_s, captured_s, known_s = (rows[c].to_numpy(dtype=float) for c in ("onset_s", "captured_s", "detection_s"))
-    result = {}
+    stage_s = {}
     out_of_view_s, hidden_s, listed_s, sent_s, arrived_s = (
         rows[c].to_numpy(dtype=float) if c in rows else np.full(len(rows), np.nan) for c in (*_SIGHT, *WAY)
     )
     listed_s = np.fmin(listed_s, captured_s)
     if np.isnan(hidden_s).any():
-        result[UNTIL_CAPTURED] = listed_s - onset_s
+        stage_s[UNTIL_CAPTURED] = listed_s - onset_s
     else:
         in_sight_s = listed_s - onset_s - out_of_view_s - hidden_s
-        result |= {OUT_OF_VIEW: out_of_view_s, HIDDEN: hidden_s, IN_SIGHT: in_sight_s}
+        stage_s |= {OUT_OF_VIEW: out_of_view_s, HIDDEN: hidden_s, IN_SIGHT: in_sight_s}
     if experiment.has_way(name):
         arrived_s = np.fmin(arrived_s, known_s)
         sent_s = np.fmin(sent_s, arrived_s)
-        result |= {LISTED: captured_s - listed_s, PROCESSING: sent_s - captured_s}
-        result |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
+        stage_s |= {LISTED: captured_s - listed_s, PROCESSING: sent_s - captured_s}
+        stage_s |= {TRANSPORT: arrived_s - sent_s, FUSION: known_s - arrived_s}
     else:
-        result |= _stages_since_capture(known_s - captured_s, experiment, name, facts)
-    return {"": float(len(rows))} | {stage: float(values.sum()) for stage, values in result.items()}
+        stage_s |= _stages_since_capture(known_s - captured_s, experiment, name, facts)
+    return {"": float(len(rows))} | {stage: float(values.sum()) for stage, values in stage_s.items()}
 
 
 def _stages_since_capture(
     delay_s: Float, experiment: Experiment, name: str, facts: ConfigurationFacts
 ) -> dict[str, Float]:
+    """The stages (s) after the capture, without times of the way: transport and fusion where they can be told apart."""
     units = experiment.units_of(experiment.configurations[name])
     if facts.by_truth_id and experiment.measure.confirm.hits == 1:
         return {TRANSPORT: delay_s, FUSION: np.zeros_like(delay_s)}

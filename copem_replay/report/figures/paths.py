@@ -123,9 +123,8 @@ NEVER_FROM = 0.5
 
 
 def late_paths_figure(results: Results, selection: Selection) -> Figure:
-    """Every path of the measured objects of a drive: grey before the onset, then coloured by the seconds unknown.
-
-    A panel per configuration, the soonest first. Raises RecordingError where the recording is missing.
+    """Every path of the measured objects of a drive: grey before the onset, then coloured by the seconds unknown. A
+    panel per configuration, the soonest first. Raises RecordingError where the recording is missing.
     """
     selected = sort_soonest_first(results, find_contenders(results, selection.configurations))
     names = [name for name in selected if name in find_differing(results, selected)]
@@ -177,7 +176,7 @@ def _find_box(drive: Drive, rows: pd.DataFrame) -> tuple[float, float, float, fl
 
 
 def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float]) -> None:
-    """Draw what stands there, the way of the ego, and the places of units."""
+    """Draw scale, lanes, what stands there, the ego's way and units' places; `box`: the four ends of the axes (m)."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     axes.set_facecolor(_GROUND)
@@ -207,7 +206,7 @@ def _draw_ground(axes: Axes, drive: Drive, box: tuple[float, float, float, float
 
 
 def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> Any:
-    """Draw the paths of the episodes of one configuration, the latest on top. Returns what has the colours."""
+    """Draw the paths of episodes, the latest on top, `most_s` darkest. Returns the lines that have the colours."""
     from matplotlib import colormaps
     from matplotlib.collections import LineCollection
     from matplotlib.colors import ListedColormap, Normalize
@@ -238,6 +237,7 @@ def _draw_paths(axes: Axes, drive: Drive, rows: pd.DataFrame, most_s: float) -> 
 def _note_sentences(
     results: Results, drive: Drive, rows: pd.DataFrame, names: Sequence[str], selected: Sequence[str]
 ) -> list[str]:
+    """The sentences below the figure: which drive, what lines and marks mean, and whose map it is."""
     logs, runs = len(results.provenance.logs), results.experiment.runs
     drive_words = f"{drive.log}, the drive of {logs} on which objects stay unknown longest" if logs > 1 else drive.log
     never = (

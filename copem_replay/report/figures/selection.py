@@ -104,25 +104,22 @@ def choose_object_and_run(results: Results, selection: Selection) -> Choice:
 
 
 def _rows_of_run(results: Results, known: pd.DataFrame, run: int | None) -> pd.DataFrame:
-    """Rows of a run for logs and objects in `known`; None: of each log's run shown in the .rrd, else run 0."""
-    parts = []
+    """Rows of one run for logs and objects in `known`; `run` None: each log's run shown in the .rrd, else run 0."""
+    rows_by_log = []
     for log in dict.fromkeys(known["log"]):
         (rows,) = results.each("object_id", "episode", "configuration", "run", *_RANKED_BY, log=log, every=True)
         rows = first_episodes(rows)
         rows = rows[rows["object_id"].isin(known.loc[known["log"] == log, "object_id"])]
         wanted_run = results.provenance.run_shown.get(log, 0) if run is None else run
-        parts.append(rows[rows["run"] == wanted_run].assign(log=log))
-    of_run = pd.concat(parts)
-    if not len(of_run):
+        rows_by_log.append(rows[rows["run"] == wanted_run].assign(log=log))
+    run_rows = pd.concat(rows_by_log)
+    if not len(run_rows):
         raise InputError(f"{results.place}: run: expected 0 to {results.experiment.runs - 1}, found {run}")
-    return of_run
+    return run_rows
 
 
 def _find_most_telling(results: Results, of_run: pd.DataFrame) -> tuple[str, str]:
-    """The object that tells configurations apart most, as the viewer shows it, and its log, the first of equal ones.
-
-    Where the recording cannot be read, how near the ego's path an object is does not decide.
-    """
+    """The log, and the object in it whose times differ most between configurations, near the ego's path if known."""
     ranking = {
         log: measure_apart(resolve_for_log(results.experiment, log), rows).sort_values(
             ["observed", "apart_s", "apart_raw_s"], ascending=False, kind="stable"
@@ -181,9 +178,8 @@ def describe_left_out(names: Sequence[str], shown: Sequence[str]) -> str:
 
 
 def pick_best_to_worst(rows: pd.DataFrame, names: Sequence[str], colours: Mapping[str, Rgb]) -> tuple[str, ...]:
-    """Up to four configurations from best to worst, by the share of rows that pass, then by mean time to detection.
-
-    An object that is never detected counts as the longest episode.
+    """Up to four configurations from best to worst, by the share of rows that pass, then by mean time to detection. An
+    object that is never detected counts as the longest episode.
     """
     longest_s = float((rows["ended_s"] - rows["onset_s"]).max())
     late_s = rows["time_to_detection_s"].fillna(longest_s).groupby(rows["configuration"]).mean()

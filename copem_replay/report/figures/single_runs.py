@@ -247,18 +247,18 @@ def _format_number(value: float) -> str:
 
 
 def _find_outcome(encounter: Encounter, driver: Driver, margin_m: float, row: Any, brake_s: float) -> tuple[float, str]:
-    """Instant and words of the end of a conflict."""
+    """When a conflict ends (s), and words on how: hit, too near, stopped, or passed."""
     if row.impact_s == row.impact_s:
         return row.impact_s, f"hits at {row.impact_speed_mps:.1f} m/s"
     course = braked_course(encounter, driver, brake_s, encounter.time_s)
-    nearest = int(np.nanargmin(course.gap_m))
+    nearest_ix = int(np.nanargmin(course.gap_m))
     if not row.braking_pass:
         near = np.flatnonzero(course.gap_m <= margin_m)  # empty if it is so only between two instants
-        return course.time_s[near[0] if len(near) else nearest], f"too near: {row.min_distance_m:.2f} m"
-    stood = _find_standstill(course, brake_s)
-    if stood is not None:
-        return stood, "stops"
-    return course.time_s[nearest], f"passes {row.min_distance_m:.1f} m away"
+        return course.time_s[near[0] if len(near) else nearest_ix], f"too near: {row.min_distance_m:.2f} m"
+    standstill_s = _find_standstill(course, brake_s)
+    if standstill_s is not None:
+        return standstill_s, "stops"
+    return course.time_s[nearest_ix], f"passes {row.min_distance_m:.1f} m away"
 
 
 def _find_standstill(course: DrivenCourse, brake_s: float) -> float | None:
@@ -326,6 +326,7 @@ def _prepare_object(results: Results, log: str, object_id: str) -> Replay:
 
 
 def _draw_stories(results: Results, replay: Replay, stories: Sequence[Story]) -> Figure:
+    """A column of panels (speed, distance, visible share) for each configuration, with its events."""
     shown = [story.configuration for story in stories]
     looks, names = choose_appearances(results), shorten_names(shown)
     begin_s, end_s = _choose_limits([event for story in stories for event in story.events], _WIDTH_IN)
@@ -365,28 +366,28 @@ def _draw_together(results: Results, replay: Replay, stories: Sequence[Story]) -
     """One column of panels for all configurations, with a mark and a label of when each knows the object."""
     shown = [story.configuration for story in stories]
     looks, names = choose_appearances(results), shorten_names(shown)
-    first = stories[0]
-    common = [event for event in first.events if event.kind not in _OF_ONE]
+    first_story = stories[0]
+    common_events = [event for event in first_story.events if event.kind not in _OF_ONE]
     known = {story.configuration: _find_known(story) for story in stories}
-    never = [names[name] for name, event in known.items() if event is None]
+    never_known = [names[name] for name, event in known.items() if event is None]
     marks = [(name, replace(event, label=f"{names[name]}: {event.label}")) for name, event in known.items() if event]
-    labelled = sorted([*(("", event) for event in common), *marks], key=lambda mark: mark[1].time_s)
+    labelled = sorted([*(("", event) for event in common_events), *marks], key=lambda mark: mark[1].time_s)
     events = [event for _, event in labelled]
     begin_s, end_s = _choose_limits(events, _WIDE_IN)
     figure = new_figure(0.75 + _WIDE_IN, 3 * _HEIGHT_IN + len(events) * STEP_IN + 1.1)
     column = figure.subplots(3, 1, sharex=True)
     since_s = np.unique(np.concatenate([np.arange(begin_s, end_s, _NODE_S), [event.time_s for event in events]]))
-    course = recorded_course(replay, results.experiment.max_gap_s, first.object_ix, since_s + first.onset_s)
+    course = recorded_course(replay, results.experiment.max_gap_s, first_story.object_ix, since_s + first_story.onset_s)
     for axes, values in zip(column, (course.speed_mps, course.gap_m), strict=False):
         axes.plot(since_s, values, label="as recorded", color=INK, linewidth=1.6)
         axes.set_ylim(-0.04 * (top := max(axes.get_ylim()[1], 1.0)), top)
-    _draw_share(column[2], first, results, replay, replace(looks[shown[0]], colour=INK))
+    _draw_share(column[2], first_story, results, replay, replace(looks[shown[0]], colour=INK))
     for name, event in labelled:
         style = event_line_style(event) | ({"color": looks[name].colour, "linewidth": 1.8} if name else {})
         for axes in column:
             axes.axvline(event.time_s, label=f"of {name}" if name else event.kind, **style)
     draw_labels(column[0], events, len(events), _HEIGHT_IN)
-    title = f"never known: {', '.join(never)}" if never else "known by all that are shown"
+    title = f"never known: {', '.join(never_known)}" if never_known else "known by all that are shown"
     column[0].set_title(title, pad=(len(events) * STEP_IN + 0.08) * 72, loc="left")
     for axes, label in zip(column, _LABELS, strict=True):
         axes.set_ylabel(label)
@@ -422,18 +423,18 @@ def _draw_courses(
         gap.plot(since_s, free.gap_m, label="as recorded", **style)
         return
     course = braked_course(story.encounter, experiment.braking.driver, story.brake_s, time_s)
-    braking = time_s <= story.impact_s
+    is_until_impact = time_s <= story.impact_s
     gap.axhline(experiment.braking.margin_m, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), label="margin")
     for axes, thin, thick in ((speed, free.speed_mps, course.speed_mps), (gap, free.gap_m, course.gap_m)):
         axes.plot(since_s, thin, color=FAINT, linewidth=1.0, label="does not brake")
-        drawn = np.where(since_s < 0, thin, thick)[braking]  # until the onset the ego does not brake
-        axes.plot(since_s[braking], drawn, label="brakes", **style)
+        with_braking = np.where(since_s < 0, thin, thick)[is_until_impact]  # until the onset the ego does not brake
+        axes.plot(since_s[is_until_impact], with_braking, label="brakes", **style)
         if np.isfinite(story.impact_s):
-            axes.plot(since_s[braking][-1:], drawn[-1:], "X", color=INK, markersize=6, label="hits")
+            axes.plot(since_s[is_until_impact][-1:], with_braking[-1:], "X", color=INK, markersize=6, label="hits")
 
 
 def _draw_share(axes: Axes, story: Story, results: Results, replay: Replay, look: Appearance) -> None:
-    """Draw the visible share from the ego's units, list by list, along the recorded course."""
+    """Draw the visible share from the ego's units, list by list, along the recorded course; pale after braking."""
     curve = share_curves(replay, replay.rows_of(np.array([story.object_ix])), story.object_ix).get(BY_EGO)
     if curve is None:
         axes.text(0.5, 0.5, "the ego carries no unit", transform=axes.transAxes, ha="center", va="center", color=FAINT)
@@ -458,6 +459,7 @@ def _draw_share(axes: Axes, story: Story, results: Results, replay: Replay, look
 
 
 def _note_sentences(results: Results, choice: Choice, stories: Sequence[Story]) -> list[str]:
+    """The sentences below the figure: which object, run and seed, what lines mean, and what is left out."""
     experiment, braking = results.experiment, results.experiment.braking
     kind = results.tally.loc[results.tally["object_id"] == choice.object_id, "object_class"].iloc[0]
     thin = ""

@@ -92,7 +92,7 @@ def _describe_left_out(tables: dict[str, pd.DataFrame], shown: dict[str, pd.Data
 
 
 def _draw_cells(axes: Axes, table: pd.DataFrame, most_s: float, colours: Colormap, links: dict[str, str]) -> None:
-    """Cells with their numbers, the configurations above, the groups at the left."""
+    """Draw a cell with its number (s) for each group and configuration; `most_s`: of the darkest; `links`: by group."""
     times_s = table.to_numpy()
     shades = colours(0.85 * np.nan_to_num(times_s) / most_s)[..., :3]
     shades[np.isnan(times_s)] = _NONE

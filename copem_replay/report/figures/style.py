@@ -429,7 +429,7 @@ def render_figure(figure: Figure, suffixes: Sequence[str] = tuple(METADATA)) -> 
 
 
 def _save(figure: Figure, suffix: str) -> bytes:
-    """The file that `savefig` writes, without drawing everything twice as it does."""
+    """The bytes of the file that `savefig` writes, without drawing everything twice as it does."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -489,7 +489,6 @@ def check_summary(results: Results) -> None:
 
 def sort_soonest_first(results: Results, names: Sequence[str]) -> tuple[str, ...]:
     """Configurations by mean time to detection; equal ones by the share that passes, then in their order.
-
     Configurations with fewer rows come last: their means are over fewer objects.
     """
     rows = results.summary.set_index("configuration")
@@ -529,9 +528,8 @@ class Dot:
 
 
 def draw_rows(axes: Axes, dots: Sequence[tuple[str, Dot]], looks: dict[str, Appearance], *, named: bool) -> None:
-    """Draw a row per dot, the first at the top; a dot is filled if it has an interval, else hollow.
-
-    `named`: with names at the left.
+    """Draw a row per dot, the first at the top; a dot is filled if it has an interval, else hollow. `named`: with names
+    at the left.
     """
     numbers = {name: k for k, name in enumerate(looks)}
     for row, (name, dot) in enumerate(dots):
@@ -548,6 +546,7 @@ def draw_rows(axes: Axes, dots: Sequence[tuple[str, Dot]], looks: dict[str, Appe
 
 
 def _draw_row(axes: Axes, row: int, dot: Dot, look: Appearance, name: str) -> None:
+    """Draw one dot with its interval, hollow without one, and its words at the right."""
     words: dict[str, Any] = {"va": "center_baseline", "fontsize": 8, "clip_on": False}
     axes.text(
         1.03, row, dot.words, transform=axes.get_yaxis_transform(), ha="left",
@@ -555,10 +554,10 @@ def _draw_row(axes: Axes, row: int, dot: Dot, look: Appearance, name: str) -> No
     )  # fmt: skip
     if dot.value is None:
         return
-    limits = dot.low is not None and dot.high is not None
+    has_limits = dot.low is not None and dot.high is not None
     if dot.low is not None and dot.high is not None:
         axes.plot([dot.low, dot.high], [row, row], color=look.colour, linewidth=2.4, zorder=2.1, label=f"of {name}")
     axes.scatter(
-        [dot.value], [row], s=_DOT, marker=look.marker, zorder=3, label=name, linewidths=1.0 if limits else 1.6,
-        facecolor=look.colour if limits else "white", edgecolor=look.colour, clip_on=False,
+        [dot.value], [row], s=_DOT, marker=look.marker, zorder=3, label=name, linewidths=1.0 if has_limits else 1.6,
+        facecolor=look.colour if has_limits else "white", edgecolor=look.colour, clip_on=False,
     )  # fmt: skip

@@ -96,7 +96,7 @@ def sweeps_figure(results: Results, *, configurations: Sequence[str] | None = No
 
 
 def _lay_out(groups: Sequence[Sequence[str]], rows: Sequence[str], kinds: Sequence[str]) -> tuple[Figure, Any]:
-    """A figure and its panels (groups, rows, kinds): of one group in lines of a quantity, of several of a group."""
+    """A figure and its panels (groups, rows, kinds): of one group a line a quantity, of several a line a group."""
     if len(groups) == 1:
         figure = new_figure(2.2 + 2.35 * len(kinds), 1.0 + 1.75 * len(rows))
         panels = figure.subplots(len(rows), len(kinds), sharex="col", sharey="row", squeeze=False)
@@ -114,9 +114,7 @@ def _lay_out(groups: Sequence[Sequence[str]], rows: Sequence[str], kinds: Sequen
 
 
 def _find_differing(sweep: pd.DataFrame, names: Sequence[str], baseline: str) -> tuple[str, ...]:
-    """Up to `MOST_LINES` configurations: the baseline, and evenly from the soonest to the latest by the mean over all
-    values.
-    """
+    """Up to `MOST_LINES` configurations: the baseline, and evenly from the soonest to the latest by mean."""
     mean_s = sweep["ttd_rmst_s"].groupby(sweep["configuration"]).mean() if "ttd_rmst_s" in sweep else pd.Series()
     others = sorted((name for name in names if name != baseline), key=lambda name: float(mean_s.get(name, 0.0)))
     picked = pick_evenly(others, MOST_LINES, [baseline])
@@ -141,7 +139,7 @@ def _add_legend(figure: Figure, panels: Any, kinds: Sequence[str], names: Sequen
 
 
 def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look: Appearance) -> None:
-    """Draw one configuration in one panel: a line with markers, and its band."""
+    """Draw one configuration in one panel: a line with markers, its band, and the exact values dashed."""
     value = rows["value"].to_numpy(dtype=float)
     if quantity == "ttd":
         middle, low, high = (_read_column(rows, f"ttd_{q}_s") for q in ("rmst", "p5", "p95"))
@@ -149,18 +147,18 @@ def _draw_series(axes: Axes, rows: pd.DataFrame, quantity: str, name: str, look:
         high = np.where(np.isnan(high) & ~np.isnan(low), np.inf, high)
     else:
         middle, low, high = (_read_column(rows, quantity + end) for end in ("", "_low", "_high"))
-    limited = ~np.isnan(low) & ~np.isnan(high)
-    if limited.any():
+    has_limits = ~np.isnan(low) & ~np.isnan(high)
+    if has_limits.any():
         high = np.minimum(high, _BEYOND_S)
         axes.fill_between(
-            value, low, high, where=limited, color=look.colour, alpha=0.12, linewidth=0, label=f"band of {name}"
+            value, low, high, where=has_limits, color=look.colour, alpha=0.12, linewidth=0, label=f"band of {name}"
         )
         for limit in (low, high):  # with lines, since bands overlap
-            shown = np.where(limited & (limit < _BEYOND_S), limit, np.nan)
+            shown = np.where(has_limits & (limit < _BEYOND_S), limit, np.nan)
             axes.plot(value, shown, color=look.colour, linewidth=0.5, label="_limit")
-        beside = np.concatenate([[False], limited[:-1]]) | np.concatenate([limited[1:], [False]])
-        alone = limited & ~beside  # a point between two without limits has no band
-        axes.vlines(value[alone], low[alone], high[alone], color=look.colour, linewidth=1)
+        has_neighbour = np.concatenate([[False], has_limits[:-1]]) | np.concatenate([has_limits[1:], [False]])
+        is_alone = has_limits & ~has_neighbour  # a point between two without limits has no band
+        axes.vlines(value[is_alone], low[is_alone], high[is_alone], color=look.colour, linewidth=1)
     line = look.line(max(look.width_pt * 0.6, 1.2))
     axes.plot(
         value, middle, marker=look.marker, markersize=4.5, markeredgecolor=look.colour, label=name, zorder=2.5, **line
@@ -190,6 +188,7 @@ def _close_open_bands(panels: Sequence[Axes]) -> None:
 
 
 def _value_axis(axes: Axes, kind: str, part: pd.DataFrame) -> None:
+    """Set scale, ticks and label of the axis of the swept quantity `kind`."""
     from matplotlib.ticker import MaxNLocator
 
     values = np.unique(part["value"].to_numpy(dtype=float))
@@ -212,6 +211,7 @@ def _describe_bands(sweep: pd.DataFrame) -> str:
 
 
 def _note_sentences(results: Results, sweep: pd.DataFrame, kinds: Sequence[str], names: Sequence[str]) -> list[str]:
+    """The sentences below the figure: rows, list rates, what bands are, and what is beyond the axis."""
     n = sorted({int(value) for value in sweep["n"].dropna()}) if "n" in sweep else []
     rows = f", n = {n[0] if n[0] == n[-1] else f'{n[0]} to {n[-1]}'} per point" if n else ""
     sentences = [f"Sweeps, {results.experiment.runs} runs{rows}, seed {results.experiment.seed}"]

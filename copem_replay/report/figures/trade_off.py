@@ -112,9 +112,7 @@ def _set_scales(axes: Axes, share: Float) -> None:
 
 
 def _sweep_existence(results: Results, name: str) -> tuple[Float, Float] | None:
-    """(T,) seconds sooner than with all entries, and (T,) time braking for nothing (%), by ascending existence; None:
-    no threshold changes anything.
-    """
+    """By ascending existence (T,): seconds sooner than with all entries, % braking for nothing; None: no change."""
     if results.rows.counts and sum(results.rows.counts.values()) > _MOST_ROWS * len(results.experiment.configurations):
         return None
     lists = results.frame("lists.parquet")
@@ -124,29 +122,29 @@ def _sweep_existence(results: Results, name: str) -> tuple[Float, Float] | None:
     steps = results.frame("thresholds.parquet")
     steps = steps[steps["configuration"] == name]
     horizon_s = results.provenance.horizon_used_s
-    some = existence <= steps["existence"].max()  # beyond, nothing is listed
-    existence, share = existence[some], share[some]
+    is_listed = existence <= steps["existence"].max()  # beyond, nothing is listed
+    existence, share = existence[is_listed], share[is_listed]
     if len(existence) < 2:
         return None
     mean_s = _mean_times_s(results, name, steps, existence, horizon_s)
-    new = np.concatenate([[True], (np.diff(mean_s) != 0) | (np.diff(share) != 0)])
-    return (mean_s[0] - mean_s[new], share[new]) if new.sum() > 1 and share.any() else None
+    is_change = np.concatenate([[True], (np.diff(mean_s) != 0) | (np.diff(share) != 0)])
+    return (mean_s[0] - mean_s[is_change], share[is_change]) if is_change.sum() > 1 and share.any() else None
 
 
 def _mean_times_s(results: Results, name: str, steps: pd.DataFrame, existence: Float, horizon_s: float) -> Float:
-    """(T,) restricted mean time to detection of the rows that count, by steps of at least each existence alone."""
-    found = [(list[Float](), list[np.ndarray]()) for _ in existence]
+    """(T,) mean time to detection (s) up to the horizon, with only entries of at least each `existence`."""
+    times_and_endings = [(list[Float](), list[np.ndarray]()) for _ in existence]
     for log in results.rows.logs:
         (rows,) = results.each("configuration", *_KEYS, "onset_s", "ended_s", "ended_by", log=log)
-        rows, of_log = rows[rows["configuration"] == name], steps[steps["log"] == log]
-        place = pd.MultiIndex.from_frame(rows[_KEYS]).get_indexer(pd.MultiIndex.from_frame(of_log[_KEYS]))
-        detection_s, onset_s = of_log["detection_s"].to_numpy(), rows["onset_s"].to_numpy()
-        for at, (times, endings) in zip(existence, found, strict=True):
-            here = (place >= 0) & (of_log["existence"].to_numpy() >= at)
+        rows, log_steps = rows[rows["configuration"] == name], steps[steps["log"] == log]
+        row_of_step = pd.MultiIndex.from_frame(rows[_KEYS]).get_indexer(pd.MultiIndex.from_frame(log_steps[_KEYS]))
+        detection_s, onset_s = log_steps["detection_s"].to_numpy(), rows["onset_s"].to_numpy()
+        for at, (times, endings) in zip(existence, times_and_endings, strict=True):
+            is_counted = (row_of_step >= 0) & (log_steps["existence"].to_numpy() >= at)
             known_s = np.full(len(rows), np.nan)
-            np.fmin.at(known_s, place[here], detection_s[here])
+            np.fmin.at(known_s, row_of_step[is_counted], detection_s[is_counted])
             time_s, ending = detection_endings(rows.assign(time_to_detection_s=known_s - onset_s))
             times.append(np.round(time_s, 9))
             endings.append(ending)
-    rounded = ((np.concatenate(times), np.concatenate(endings)) for times, endings in found)
+    rounded = ((np.concatenate(times), np.concatenate(endings)) for times, endings in times_and_endings)
     return np.array([restricted_mean(*cumulative_incidence(*each), horizon_s) for each in rounded])

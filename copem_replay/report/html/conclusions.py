@@ -90,6 +90,7 @@ def _format_points(row: Any) -> str:
 
 
 def _detected_sentences(study: ReportData, share: pd.Series) -> Iterator[str]:
+    """Sentences on who never detects anything, or misses some objects; `share`: detected share by configuration."""
     never = [name for name in study.contenders if share[name] == 0]
     if never:
         yield f"{join_names(never)} never {'detects' if len(never) == 1 else 'detect'} any object."
@@ -98,9 +99,9 @@ def _detected_sentences(study: ReportData, share: pd.Series) -> Iterator[str]:
         return
     missed = [(name, 1 - float(share[name])) for name in study.contenders if 0 < share[name] < 1]
     if missed:
-        worst, least = max(missed, key=itemgetter(1)), min(missed, key=itemgetter(1))
+        worst, fewest = max(missed, key=itemgetter(1)), min(missed, key=itemgetter(1))
         rows = "of the rows (objects × runs)"
-        if format_per_cent(worst[1]) == format_per_cent(least[1]):
+        if format_per_cent(worst[1]) == format_per_cent(fewest[1]):
             names = join_names([name for name, _ in missed])
             yield (
                 f"{names} {'each miss' if len(missed) > 1 else 'misses'} {format_per_cent(worst[1])} % {rows}; Never "
@@ -108,12 +109,13 @@ def _detected_sentences(study: ReportData, share: pd.Series) -> Iterator[str]:
             )
         else:
             yield (
-                f"{len(missed)} configurations miss some objects, from {least[0]} with {format_per_cent(least[1])} % "
+                f"{len(missed)} configurations miss some objects, from {fewest[0]} with {format_per_cent(fewest[1])} % "
                 f"to {worst[0]} with {format_per_cent(worst[1])} % {rows}; Never detected names the objects."
             )
 
 
 def _pass_sentences(study: ReportData) -> Iterator[str]:
+    """A sentence on the best and the worst share of conflicts that pass; none without verdicts."""
     rows = study.results.summary.set_index("configuration")
     if "pass_share" not in rows:
         return
@@ -171,6 +173,7 @@ def _variation_sentences(study: ReportData) -> Iterator[str]:
 
 
 def _certainty_sentences(study: ReportData) -> Iterator[str]:
+    """A sentence on what intervals are over, or why there are none."""
     over, kind = (study.results.summary[name].dropna() for name in ("interval_over", "interval"))
     if not len(over) and (kind == NOTHING_DRAWN).any():
         yield (

@@ -128,9 +128,8 @@ def _enlarge(size: re.Match[str]) -> str:
 
 
 def figure_element(name: str, figure: Figure, title: str, shows: str, looks: Iterable[Appearance] = ()) -> Html:
-    """A figure as an element of a page, scrolled where there is no room.
-
-    `shows`: text for screen readers. `looks`: of configurations, whose colours are others on a dark page.
+    """A figure as an element of a page, scrolled where there is no room. `shows`: text for screen readers. `looks`: of
+    configurations, whose colours are others on a dark page.
     """
     note = take_note(figure)
     svg = render_figure(figure, (".svg",))[".svg"].decode("utf-8")
@@ -194,7 +193,7 @@ def build_page(study: ReportData) -> str:
 
 
 def _false_sections(study: ReportData) -> Iterator[_Section]:
-    """A list of the false tracks of one run, where it has any."""
+    """A section that lists the false tracks of the run that is shown, where it has any."""
     results, shown = study.results, study.results.provenance.run_shown
     log = next(iter(shown), results.provenance.logs[0].name)
     if not results.has(FALSE_TRACKS):
@@ -203,12 +202,12 @@ def _false_sections(study: ReportData) -> Iterator[_Section]:
     rows = rows[(rows["log"] == log) & (rows["run"] == shown.get(log, 0))]
     items = []
     for name in study.contenders:
-        of_name = rows[rows["configuration"] == name]
+        tracks = rows[rows["configuration"] == name]
         items.append(
             join_html(
                 [
                     make_tag("b", name),
-                    f", {len(of_name)}: {describe_false_tracks(of_name)}" if len(of_name) else ": none",
+                    f", {len(tracks)}: {describe_false_tracks(tracks)}" if len(tracks) else ": none",
                 ]
             )
         )
@@ -264,11 +263,11 @@ def _figure_sections(study: ReportData, names: Sequence[str]) -> Iterator[_Secti
     """A section per figure, with the reason in place of one that cannot be drawn."""
     for name in names:
         kind = FIGURES[name]
-        reason = "" if name in _ALONE else kind.missing(study.results, _select(study))
-        if reason == "" or not len(study.results.known):
+        why_missing = "" if name in _ALONE else kind.missing(study.results, _select(study))
+        if why_missing == "" or not len(study.results.known):
             continue
-        if reason is not None:
-            yield _Section(f"section-{name}", kind.title, [make_tag("p", f"No figure: {reason}.")])
+        if why_missing is not None:
+            yield _Section(f"section-{name}", kind.title, [make_tag("p", f"No figure: {why_missing}.")])
             continue
         paragraphs = [make_tag("p", line) for line in kind.about(study.results)]
         tables = [_BELOW[name](study)] if name in _BELOW else []

@@ -75,7 +75,7 @@ def _count_read(results: Results) -> dict[str, tuple[str, str]]:
 
 
 def _read_table(logs: Sequence[Any]) -> Iterator[Html]:
-    """What was left out or mended of each recording; nothing where all was as it should be."""
+    """A table of what was left out or mended of each recording; nothing where all was as it should be."""
     rows = [
         make_tag(
             "tr",
@@ -135,6 +135,7 @@ def describe_unit_errors(experiment: Experiment) -> str:
 
 
 def _describe_unit(unit: Unit) -> list[str]:
+    """Phrases on what is wrong with a unit beside its PEM: outages, pose, clock, what it fuses."""
     errors = []
     if unit.fuses is not None:
         kind = "ideal" if unit.fusion is None else unit.fusion.kind
@@ -157,6 +158,7 @@ def _describe_unit(unit: Unit) -> list[str]:
 
 
 def _describe_pem(pem: Pem) -> list[str]:
+    """Phrases on what a PEM gets wrong beside misses and errors: ghosts, classes, track ids."""
     errors = []
     if pem.ghosts:
         errors.append(
@@ -230,7 +232,7 @@ def describe_setting(study: ReportData) -> str:
 
 
 def _describe_others(experiment: Experiment, rest: pd.DataFrame) -> str:
-    """Episodes that do not count, one row each: how many, and why: most were there when the recording began."""
+    """Episodes (a row each) that do not count: how many and why; most were there when the recording began."""
     noun, one = "object" if rest["episode"].max() == 0 else "episode", len(rest) == 1
     where = "in range" if experiment.measure.onset.kind == "in_range" else "there"
     if (rest["began"] == BEGAN[LOG_START]).all() and BEGAN[LOG_START] not in experiment.measure.began:

@@ -86,10 +86,8 @@ class ReportData:
 
 
 def load_study(source: Path | Results, baseline: str | None = None, by: Sequence[str] | None = None) -> ReportData:
-    """Compare the configurations of results, or of a results folder, with a baseline.
-
-    None: that of `compare`. `by`: entries of slices, None: those of the experiment. Raises InputError: no or damaged
-    results, no such baseline.
+    """Compare the configurations of results, or of a results folder, with a baseline. None: that of `compare`. `by`:
+    entries of slices, None: those of the experiment. Raises InputError: no or damaged results, no such baseline.
     """
     results = source if isinstance(source, Results) else read_results(source, rowless=True)
     check_summary(results)

@@ -163,6 +163,7 @@ def row_head(study: ReportData, name: str) -> Html:
 
 
 def _summary_cell(row: dict[str, Any], name: str) -> Html:
+    """The cell of one metric of a configuration, with its limits, and the full number as data."""
     value = float("nan") if pd.isna(row[name]) else float(row[name])
     parts = [Html(format_value(name, value))]
     with_limits, scale = name in (*_INTERVALS, *JUDGED_DRIVING), 100 if is_share(name) else 1
@@ -190,6 +191,7 @@ def full_number(value: Any) -> str | None:
 
 
 def _interval_sentences(study: ReportData, columns: Iterable[str]) -> list[str]:
+    """Sentences below a table: what the intervals of its columns are over, and up to when means are."""
     rows = study.results.summary
     sentences = []
     for column in (name for name in columns if name in _INTERVALS):
@@ -284,6 +286,7 @@ def baseline_words(study: ReportData) -> Html:
 
 
 def _difference_cell(row: Any, metric: str) -> Html:
+    """The cell of one difference with its limits and star; “–” without a value."""
     if row is None or pd.isna(row.difference):
         return make_tag("td", "–", data_column=metric)
     limits = row.low, row.high
@@ -344,6 +347,7 @@ def exact_misses(study: ReportData) -> Html:
 
 
 def _exact_sentence(row: dict[str, Any]) -> Html:
+    """A sentence on how probably a configuration never detects an object, and how probably the ego fails."""
     missed, half, fails = (
         float(row.get(name, math.nan)) for name in ("miss_log10", "miss_log10_half_odds", "fail_share_exact")
     )
@@ -397,6 +401,7 @@ def _group_misses(missed: pd.DataFrame, order: Sequence[str]) -> list[tuple[pd.S
 
 
 def _missed_row(study: ReportData, row: pd.Series, names: list[str]) -> Html:
+    """The row of an object that the configurations `names` miss: in how many runs, and links to it."""
     by_all = len(names) == len(study.names) > 1
     configurations = f"all {len(names)} configurations" if by_all else ", ".join(names)
     suffix = f", episode {row['episode']}" if row["episode"] else ""
@@ -438,6 +443,7 @@ def stage_table(study: ReportData) -> Html:
 def _stages_table(
     study: ReportData, means: dict[str, dict[str, float]], stages: list[str], detected: dict[str, tuple[int, int]]
 ) -> Html:
+    """The table of the stages' mean durations (s) by configuration, with their sum."""
     rows = []
     for name in study.ranked:
         figures = [*(means[name].get(stage) for stage in stages), sum(means[name].values()) if means[name] else None]

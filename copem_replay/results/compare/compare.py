@@ -392,13 +392,13 @@ class Stars:
     without: Sequence[str] = ()
 
     def mark(self, rows: Sequence[dict[str, Any]], limit: Sequence[Callable[[float], Mapping[str, object]]]) -> None:
-        """Add the columns `star` and `word` to the rows of one table; `limit`: by row its limits at a confidence."""
+        """Set `star` and `word` in each row of a table; `limit[k](confidence)` gives the interval columns of row k."""
         may_differ = (k for k, row in enumerate(rows) if row["configuration"] not in self.without)
-        asked = [k for k in may_differ if self.decide in (None, rows[k]["metric"])]
-        number = sum(rows[k]["difference"] is not None for k in asked)
+        decided = [k for k in may_differ if self.decide in (None, rows[k]["metric"])]
+        difference_count = sum(rows[k]["difference"] is not None for k in decided)
         off_zero = {k for k, row in enumerate(rows) if is_off_zero(row)}
-        may = [k for k in asked if k in off_zero]
-        starred = {may[k] for k in find_stars(number, [limit[k] for k in may])}
+        decided_off_zero = [k for k in decided if k in off_zero]
+        starred = {decided_off_zero[k] for k in find_stars(difference_count, [limit[k] for k in decided_off_zero])}
         for k, row in enumerate(rows):
             row["star"] = STAR if k in starred else ALONE if k in off_zero else None
             if row["metric"] in self.matters and row["difference"] is not None:
@@ -408,9 +408,8 @@ class Stars:
 def _settle_ghosts(
     setting: PairSettings, pairs: Pairs, totals: Mapping[LabelledConfiguration, GhostTotals], requested: float | None
 ) -> tuple[dict[LabelledConfiguration, PairSettings], dict[str, str | None]]:
-    """The settings of each pair, with operating points at equal ghosts; by label why there are none, None: there are.
-
-    `requested`: ghosts per minute that the user asked for; None: those of each baseline.
+    """By pair its settings with the operating points at equal ghosts; by label why there are none (None: they exist).
+    `requested`: ghosts per minute that the user set; None: the rate of each pair's baseline.
     """
     settings, reasons = {}, {}
     for labelled, baseline in pairs.items():
@@ -430,12 +429,11 @@ def _compare_each_log(
     pair_rows: PairRows, settings: Mapping[LabelledConfiguration, PairSettings], metrics: Sequence[str] | None,
     groups: EpisodeGroups,
 ) -> tuple[dict[LabelledConfiguration, AllLogs], list[dict[str, object]], GroupPairs]:  # fmt: skip
-    """The sums of each pair over the logs; rows of each log where there are several; the sums of each group.
-
-    The objects of the logs are appended to the names of clusters.
+    """The figures of each pair summed over logs; the rows of each log, where there are several; the sums by group.
+    Appends the objects of each log to the names of clusters.
     """
-    names, asked, pairs, remembering = pair_rows.names, pair_rows.asked, pair_rows.pairs, pair_rows.remembering
-    logs, sums, of_groups = names.logs, {labelled: AllLogs() for labelled in pairs}, GroupPairs()
+    names, pairs_asked, pairs, remembering = pair_rows.names, pair_rows.asked, pair_rows.pairs, pair_rows.remembering
+    logs, sums, group_sums = names.logs, {labelled: AllLogs() for labelled in pairs}, GroupPairs()
     rows: list[dict[str, object]] = []
     for k, log in enumerate(logs):
         tables = {
@@ -447,7 +445,7 @@ def _compare_each_log(
         names.objects.extend(f"{log}\n{name}" for name in grid.objects)
 
         def lay_out(one: LabelledConfiguration, log: str = log, grid: PairingGrid = grid, of: Any = tables) -> PairSide:
-            return asked.restrict(log, grid, lay_out_configuration(one, of[one.results], grid))
+            return pairs_asked.restrict(log, grid, lay_out_configuration(one, of[one.results], grid))
 
         # What several are held against is laid out once, what one is held against is gone after it.
         lay_out_baseline = lru_cache(1 + len({*remembering.values()}))(lay_out)
@@ -457,18 +455,18 @@ def _compare_each_log(
             _check_same_episodes(labelled, first, baseline, second, log, grid)
             _check_same_frames(labelled, first, baseline, second, log)
             regrets = _compute_regrets(first, second, remembered, grid, settings[labelled], metrics)
-            sums[labelled].add(first, second, regrets, several=len(logs) > 1, over_runs=asked.over_runs)
-            for regret in regrets if len(logs) > 1 and asked.by_log else ():
+            sums[labelled].add(first, second, regrets, several=len(logs) > 1, over_runs=pairs_asked.over_runs)
+            for regret in regrets if len(logs) > 1 and pairs_asked.by_log else ():
                 values = regret.figure.values()
                 sums[labelled].differences.setdefault(regret.metric, []).append(values[2])
                 rows.append({"log": log, **pair_rows.make(labelled, regret, values)})
-            for group, kept in groups.select(log, grid):
-                first_group, second_group = (groups.restrict(group, kept, side) for side in (first, second))
-                beside = None if remembered is None else groups.restrict(group, kept, remembered)
+            for group, cells in groups.select(log, grid):
+                first_group, second_group = (groups.restrict(group, cells, side) for side in (first, second))
+                beside = None if remembered is None else groups.restrict(group, cells, remembered)
                 regrets = _compute_regrets(first_group, second_group, beside, grid, settings[labelled], metrics)
-                of_pair = of_groups.setdefault(group, {}).setdefault(labelled, AllLogs())
-                of_pair.add(first_group, second_group, regrets, several=len(logs) > 1)
-    return sums, rows, of_groups
+                pair_sums = group_sums.setdefault(group, {}).setdefault(labelled, AllLogs())
+                pair_sums.add(first_group, second_group, regrets, several=len(logs) > 1)
+    return sums, rows, group_sums
 
 
 def _compute_regrets(
@@ -485,17 +483,17 @@ def _compute_regrets(
 
 
 def _tabulate_groups(pair_rows: PairRows, of_groups: GroupPairs, groups: EpisodeGroups, stars: Stars) -> pd.DataFrame:
-    """The rows of `Comparison.groups`; those of an entry are one table."""
+    """`Comparison.groups`: a row by group, pair and metric. Stars hold within the rows of one `by` entry."""
     rows: list[dict[str, Any]] = []
     limit: list[Callable[[float], Mapping[str, object]]] = []
-    of_group = replace(pair_rows, asked=PairsAsked(weigh=pair_rows.asked.weigh))
+    group_rows_maker = replace(pair_rows, asked=PairsAsked(weigh=pair_rows.asked.weigh))
     for k, (by, group) in enumerate(groups.named):
-        found, of_found = of_group.of_all_logs(of_groups.get(k, {}))
-        rows += [{"by": by.label, "group": group, **without_limits_over_runs(row)} for row in found]
-        limit += of_found
+        group_rows, group_limits = group_rows_maker.of_all_logs(of_groups.get(k, {}))
+        rows += [{"by": by.label, "group": group, **without_limits_over_runs(row)} for row in group_rows]
+        limit += group_limits
     for label in {row["by"] for row in rows}:
-        of_entry = [k for k, row in enumerate(rows) if row["by"] == label]
-        stars.mark([rows[k] for k in of_entry], [limit[k] for k in of_entry])
+        entry_rows = [k for k, row in enumerate(rows) if row["by"] == label]
+        stars.mark([rows[k] for k in entry_rows], [limit[k] for k in entry_rows])
     table = COMPARISON.frame(rows).drop(columns="log")
     for place, name in enumerate(("by", "group")):
         table.insert(place, name, pd.Series([row[name] for row in rows], dtype=object))
@@ -514,9 +512,8 @@ class PairRows:
     def of_all_logs(
         self, sums: Mapping[LabelledConfiguration, AllLogs]
     ) -> tuple[list[dict[str, Any]], list[Callable[[float], Mapping[str, object]]]]:
-        """The rows over all logs, each with its limits at a confidence.
-
-        Of intervals over logs: the number of logs that are better, and the log on which the difference hangs.
+        """The rows over all logs, and for each row a function from a confidence to its interval columns. With an
+        interval over logs: also how many logs are better, and the one that decides the sign.
         """
         rows: list[dict[str, Any]] = []
         limit: list[Callable[[float], Mapping[str, object]]] = []
@@ -535,7 +532,7 @@ class PairRows:
     def make(
         self, labelled: LabelledConfiguration, regret: Regret, values: tuple[float, float, float]
     ) -> dict[str, object]:
-        """The row of a regret with its `values`, of one log or all."""
+        """One row of the comparison table; `values`: of the configuration, of the baseline, and their difference."""
         figure, (value, baseline_value, difference) = regret.figure, map(_number_or_none, values)
         row: dict[str, object] = {
             "configuration": labelled.label, "baseline": self._baseline_of(labelled, regret.metric).label,
@@ -562,19 +559,19 @@ class PairRows:
     def _limit(
         self, labelled: LabelledConfiguration, regret: Regret, values: tuple[float, float, float], confidence: float
     ) -> dict[str, object]:
-        """The columns of a difference's limits at a confidence; no limit is where the difference cannot be."""
+        """The interval columns (`low`, `high`, …), cut at 0 where one side can never be worse than the other."""
         over, difference = "runs" if self.asked.over_runs else regret.over, values[2]
         sides = labelled, self._baseline_of(labelled, regret.metric)
         fact = "fixed_verdicts" if regret.metric == "pass_share" else "fixed"
         fixed = all(getattr(side.facts, fact) for side in sides)
         limits = difference_limits(regret.figure, difference, over, self.names, fixed=fixed, confidence=confidence)
-        never = [_is_never_worse(regret.metric, *of) for of in zip(sides, sides[::-1], values, strict=False)]
-        sign = COMPARED[regret.metric].better * (never[0] - never[1])
+        never_worse = [_is_never_worse(regret.metric, *of) for of in zip(sides, sides[::-1], values, strict=False)]
+        sign = COMPARED[regret.metric].better * (never_worse[0] - never_worse[1])
         if sign * difference < 0 or not sign:
             return limits
-        least, most = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
+        low_bound, high_bound = (0.0, math.inf) if sign > 0 else (-math.inf, 0.0)
         ends: dict[str, Any] = {name: limits.get(name) for name in ("low", "high", "low_bounded", "high_bounded")}
-        return limits | {name: min(max(end, least), most) for name, end in ends.items() if end is not None}
+        return limits | {name: min(max(end, low_bound), high_bound) for name, end in ends.items() if end is not None}
 
 
 def _number_or_none(value: float) -> float | None:
@@ -614,7 +611,7 @@ def _check_same_episodes(
     labelled: LabelledConfiguration, first: PairSide, baseline: LabelledConfiguration, second: PairSide, log: str,
     grid: PairingGrid,
 ) -> None:  # fmt: skip
-    """Raise InputError where an episode begins or ends at another instant, so that its rows are no pair."""
+    """Raise InputError where an episode begins or ends at different times in two folders: its rows cannot be paired."""
     if labelled.results is baseline.results:
         return
     in_both = first.there & second.there
@@ -632,7 +629,7 @@ def _check_same_episodes(
 def _check_same_frames(
     labelled: LabelledConfiguration, first: PairSide, baseline: LabelledConfiguration, second: PairSide, log: str
 ) -> None:
-    """Raise InputError where what is held is told at other frames, so that its values are no pairs."""
+    """Raise InputError where the accuracy of a pair was measured at different frames, so that it is no pair."""
     in_both = first.there & second.there
     if first.accuracy is None or second.accuracy is None or not in_both.any():
         return

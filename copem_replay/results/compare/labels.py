@@ -98,6 +98,7 @@ def notes_on_differences(folders: Sequence[Results], names: Mapping[Results, Map
 
 
 def _describe_differences(first: Results, other: Results, names: Mapping[Results, Mapping[str, str]]) -> Iterator[str]:
+    """Each difference that does not prevent a comparison: log names, recordings, versions, models, list rates."""
     own_names, theirs = log_keys(first, other)
     for key in sorted(own_names, key=lambda key: own_names[key].name):
         log, other_log = own_names[key], theirs[key]
@@ -121,7 +122,7 @@ def _describe_differences(first: Results, other: Results, names: Mapping[Results
 
 
 def _compare_keys(where: str, before: Any, after: Any) -> Iterator[str]:
-    """Values that differ; below the first level also keys that only one has. Of models of two kinds only the kinds."""
+    """`key (before, after)` of values that differ; of models of two kinds only `kind`, of new keys only deep ones."""
     lists = isinstance(before, list) and isinstance(after, list) and len(before) == len(after)
     if lists and all(isinstance(value, dict) for value in (*before, *after)):
         before, after = dict(enumerate(before)), dict(enumerate(after))
@@ -163,6 +164,7 @@ def check_comparable(folders: Sequence[Results]) -> None:
 
 
 def _find_problems(first: Results, other: Results) -> Iterator[str]:
+    """A line for each difference that prevents a comparison: truth, seed, window, ego, measures, driver."""
     before, after = first.provenance, other.provenance
     other_logs = list(_compare_logs(first, other))
     if before.window_s == after.window_s:  # else their truths may differ for that reason alone
@@ -382,14 +384,14 @@ def pair_configurations(
 def _pair_with_first(
     folders: Sequence[Results], known: Sequence[LabelledConfiguration], chosen: Sequence[LabelledConfiguration]
 ) -> dict[LabelledConfiguration, LabelledConfiguration]:
-    """Configurations of later folders, each with itself in the first one. Raises InputError where there is none."""
-    old = {labelled.configuration: labelled for labelled in known if labelled.results is folders[0]}
+    """Each chosen configuration of a later folder → its namesake in the first. Raises InputError: there is none."""
+    in_first = {labelled.configuration: labelled for labelled in known if labelled.results is folders[0]}
     later = [labelled for labelled in dict.fromkeys(chosen) if labelled.results is not folders[0]]
-    pairs = {labelled: old[labelled.configuration] for labelled in later if labelled.configuration in old}
+    pairs = {labelled: in_first[labelled.configuration] for labelled in later if labelled.configuration in in_first}
     if not pairs:
         names = ", ".join(dict.fromkeys(labelled.configuration for labelled in later)) or "none"
         raise InputError(
-            f"compare: expected a configuration of {folders[0].place} ({', '.join(old)}) in a later folder, found "
+            f"compare: expected a configuration of {folders[0].place} ({', '.join(in_first)}) in a later folder, found "
             f"{names}; --baseline NAME holds all against one"
         )
     return pairs

@@ -69,7 +69,7 @@ class StatisticItems:
         return self.columns[name]
 
     def condensed(self, *, runs: bool) -> StatisticItems:
-        """The items with equal ones joined. `runs`: items of several runs and passes stay apart."""
+        """Items that are equal in all but the summed columns, added up to one. `runs`: not across runs and passes."""
         columns = dict(self.columns)
         for name in ("runs", "passes"):
             columns[name] = self[name] if runs else np.full_like(self[name], -1)
@@ -284,13 +284,13 @@ class SumStatistic(PairStatistic):
         return np.stack(columns, axis=1), sums[~within].sum(axis=0)
 
     def without_each(self, clusters: ClusterIndex) -> Float:
-        """(K,) differences without each cluster, for which the others count. Items of no cluster stay."""
-        by_cluster, always = self._sums_by_cluster(clusters)
+        """(K,) the difference without cluster k, the others scaled up to its weight. Items of no cluster stay."""
+        by_cluster, sums_of_no_cluster = self._sums_by_cluster(clusters)
         sums = by_cluster.sum(axis=0) - by_cluster
-        if always.any():
+        if sums_of_no_cluster.any():
             weights = clusters.count_objects(self.items)
             total = weights.sum()
-            sums = sums * (total / np.where(weights < total, total - weights, total))[:, None] + always
+            sums = sums * (total / np.where(weights < total, total - weights, total))[:, None] + sums_of_no_cluster
         with np.errstate(divide="ignore", invalid="ignore"):
             first, second = self.of(sums)
             difference: Float = first - second

@@ -122,7 +122,7 @@ def ghost_totals(
 def _add_log(
     labelled: LabelledConfiguration, before: GhostTotals | None, rows: pa.Table, steps: pa.Table, runs: int
 ) -> GhostTotals:
-    """The totals of the earlier logs and of one more, in the first `runs` runs."""
+    """Ghost totals of `before` (None: the first log) and of one log's first `runs` runs, by existence threshold."""
     lengths, existence = list_column(rows["existence"])
     counts, ghosts_at = list_column(rows["ghosts_at"])
     thresholds = existence[: lengths[0]] if len(lengths) else existence
@@ -139,11 +139,11 @@ def _add_log(
     minutes = float(float_column(rows["minutes"])[compared].sum())
     ghosts = ghosts_at.reshape(size)[compared].sum(axis=0).astype(np.int64)
     steps_at = float_column(steps["existence"])[integer_column(steps["run"], missing=runs) < runs]
-    least, most = float(steps_at.min(initial=np.inf)), float(steps_at.max(initial=-np.inf))
+    lowest_step, highest_step = float(steps_at.min(initial=np.inf)), float(steps_at.max(initial=-np.inf))
     if before is None or not len(before.existence):
-        return GhostTotals(minutes, thresholds, ghosts, least, most)
+        return GhostTotals(minutes, thresholds, ghosts, lowest_step, highest_step)
     ghosts = ghosts if len(lengths) else np.zeros_like(before.at)
-    extremes = min(before.least, least), max(before.most, most)
+    extremes = min(before.least, lowest_step), max(before.most, highest_step)
     return GhostTotals(before.minutes + minutes, before.existence, before.at + ghosts, *extremes)
 
 

@@ -52,16 +52,16 @@ class PairingGrid:
         return object_ix[np.where(cells < 0, -1, cells // self.runs)]
 
     def cells(self, table: pa.Table) -> Int:
-        """(n,) the cell of each row of a table, −1: a run that is not compared, or an object that is not measured."""
+        """(n,) the grid cell of each row of a table; −1: its run is not compared, or its episode is not in the grid."""
         object_ix = integer_column(
             pc.index_in(table["object_id"], value_set=pa.array(self.objects, pa.string())), missing=-1
         )
         number, run = integer_column(table["episode"], missing=-1), self.runs_of(table)
-        most = max((n for _, n in self.episodes), default=0) + 1
-        place_of = np.full((len(self.objects) + 1, most + 1), -1)
+        episode_limit = max((n for _, n in self.episodes), default=0) + 1
+        row_of_episode = np.full((len(self.objects) + 1, episode_limit + 1), -1)
         for k, (name, n) in enumerate(self.episodes):
-            place_of[self.objects.index(name), n] = k
-        place = place_of[object_ix, np.where((number >= 0) & (number < most), number, most)]
+            row_of_episode[self.objects.index(name), n] = k
+        place = row_of_episode[object_ix, np.where((number >= 0) & (number < episode_limit), number, episode_limit)]
         return np.where((place >= 0) & (run >= 0), place * self.runs + run, -1)
 
     def runs_of(self, table: pa.Table) -> Int:
@@ -222,6 +222,7 @@ def _check_once(place: Path, cell: Int, configuration: str) -> None:
 
 
 def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: PairingGrid) -> AccuracyData | None:
+    """What a configuration holds frame by frame, laid out by cell; None: its accuracy is not measured."""
     if not {"accuracy.parquet", "instants.parquet"} <= set(tables):
         return None
     rows, place = tables["accuracy.parquet"], folder / "accuracy.parquet"
@@ -246,15 +247,15 @@ def _accuracy_data(folder: Path, tables: dict[str, pa.Table], cell: Int, grid: P
 
 
 def _read_frames(place: Path, rows: pa.Table, grid: PairingGrid) -> tuple[Float, Int, Bool, Int]:
-    """`frame_s`, `begins`, `holds` and `of_run` of `AccuracyData`; the last row holds nothing, for runs without one."""
-    counts, every_s = list_column(rows["frame_s"])
+    """`frame_s`, `begins`, `holds`, `of_run` of `AccuracyData`; the last row of `holds`, all False: no lists."""
+    counts, all_frames_s = list_column(rows["frame_s"])
     numbers, held_list = list_column(rows["held_list"])
     issued, available_s = list_column(rows["available_s"])
     frames = int(counts[0]) if len(counts) else 0
     consistent = (counts == frames).all() and (numbers == frames).all()
-    if not consistent or (every_s.reshape(len(counts), frames) != every_s[:frames]).any():
+    if not consistent or (all_frames_s.reshape(len(counts), frames) != all_frames_s[:frames]).any():
         raise InputError(f"{place}: expected the same frame_s in all rows of a log, and as many held_list; {AGAIN}")
-    frame_s = every_s[:frames]
+    frame_s = all_frames_s[:frames]
     first_s = np.append(available_s, np.inf)[np.where(issued > 0, np.cumsum(issued) - issued, len(available_s))]
     begins = np.searchsorted(frame_s, first_s - SAME_INSTANT_S, side="left")
     holds = np.concatenate([~np.isnan(held_list).reshape(len(counts), frames), np.zeros((1, frames), dtype=bool)])
@@ -337,9 +338,8 @@ def pair_held_lists(first: AccuracyData, second: AccuracyData, grid: PairingGrid
 def _align_frames(
     first: AccuracyData, second: AccuracyData, begins: Int, cells: Int, part: Int
 ) -> tuple[Int, Int, tuple[Int, Int]]:
-    """(V,) rows of `cells`, frames, and places in the values of both: of the rows `part` of `cells (C,)`.
-
-    `begins (C,)`: the first frame that counts.
+    """Frame by frame of rows `cells[part]`: (V,) row, (V,) frame, and (V,) place of its value on each side. `begins
+    (C,)`: frames before these are left out.
     """
     length = first.length[cells[part]]
     row = np.repeat(part, length)

@@ -123,6 +123,7 @@ def write_comparison(comparison: Comparison, path: Path, folders: Sequence[Path]
 
 
 def _format_cells(comparison: Comparison) -> pd.DataFrame:
+    """The table for people: a row by configuration, a column by metric that is not 0 or missing throughout."""
     rows = {(row.configuration, row.metric): row for row in comparison.overall.itertuples(index=False)}
     metrics = [metric for metric in COMPARED if any((name, metric) in rows for name in comparison.configurations)]
     if not any(row.value or row.baseline_value for (_, metric), row in rows.items() if metric == SHARE):
@@ -203,7 +204,7 @@ def comparison_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]:
-    """Lines on the marks of a table, on what decides, and on what matters."""
+    """Lines below a table: what its star marks mean, which metric decides, and the least difference that matters."""
     number = int(rows["difference"].notna().sum())
     decide = comparison.decide
     decided = number if decide is None else int(rows.loc[rows["metric"] == decide, "difference"].notna().sum())
@@ -225,15 +226,13 @@ def _describe_stars(comparison: Comparison, rows: pd.DataFrame) -> Iterator[str]
 
 
 def _describe_better(comparison: Comparison) -> Iterator[str]:
-    """Lines on the configurations that are better than the baseline, or worse in braking for nothing; metrics with the
-    same ones share a line.
-    """
+    """Lines on who is better than the baseline (in needless braking also worse); metrics with equal names share one."""
     metrics: dict[tuple[str, str, str], list[str]] = {}
     for metric, row in COMPARED.items():
-        of_metric = comparison.overall[comparison.overall["metric"] == metric]
-        gain = of_metric["difference"] * row.better
+        metric_rows = comparison.overall[comparison.overall["metric"] == metric]
+        gain = metric_rows["difference"] * row.better
         for word, beyond in (("better", gain > 0), ("worse", (gain < 0) & (row.part == "needless"))):
-            rows_beyond = of_metric[beyond & (of_metric["star"] == STAR)]
+            rows_beyond = metric_rows[beyond & (metric_rows["star"] == STAR)]
             for baseline, rows in rows_beyond.groupby("baseline", sort=False):
                 names = ", ".join(map(_name_with_logs, rows.itertuples(index=False)))
                 metrics.setdefault((word, names, str(baseline)), []).append(metric)
@@ -264,7 +263,7 @@ def describe_gain(row: Any) -> str:
 
 
 def _describe_held(comparison: Comparison) -> Iterator[str]:
-    """Lines on figures of what both hold, and on the table beside them."""
+    """Lines that explain the columns on errors of the held list, and the extra table; none without such columns."""
     if not len(held_cells(comparison)):
         return
     yield (
@@ -307,7 +306,7 @@ def escape_markdown(text: str) -> str:
 
 
 def _describe_intervals(overall: pd.DataFrame) -> Iterator[str]:
-    """Lines on differences with other kinds of intervals, or without any, as nothing varies."""
+    """Lines that explain cells without the usual interval: exact limits, all pairs alike, or runs that do not vary."""
     kinds = {kind: list(dict.fromkeys(of["metric"])) for kind, of in overall.groupby("interval", sort=False)}
     if EXACT in kinds:
         yield f"{', '.join(kinds[EXACT])}: exact binomial limits where the difference is the same in every cluster"
