@@ -164,12 +164,11 @@ def _fit_pose_memory(lags: Float, period_s: float, n: int) -> LastingPart | None
         mean = sums[:, 0] / np.maximum(sums[:, 1], 1)
         weight = np.sqrt(sums[1:, 1] / max(sums[0, 1], 1))
 
-        def measure_residuals(x: Float) -> Float:
+        def residuals_at(x: Float) -> Float:
             residual: Float = weight * (mean[1:] / mean[0] - np.clip(x[0], 0, 1) * np.exp(-delta_s / np.exp(x[1])))
             return residual
 
-        start = [0.7, np.log(10 * period_s)]
-        solution: Float = least_squares(measure_residuals, start, bounds=([0, -5], [1, 9])).x
+        solution: Float = least_squares(residuals_at, [0.7, np.log(10 * period_s)], bounds=([0, -5], [1, 9])).x
         return solution
 
     best = fit_decay(lags.sum(axis=2))
