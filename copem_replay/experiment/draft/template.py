@@ -373,7 +373,8 @@ def _draft_configurations(units: Sequence[str], recorded: Sequence[str]) -> Iter
     rows += [(name, f"{{units: [{name}], {gnn}}}", "as it was recorded") for name in others]
     if len(others) > 1 and {*others} != {*units}:
         rows.append(("recorded", f"{{units: [{', '.join(others)}], {gnn}}}", "all of them"))
-    rows.append(("late", f"{start}, {gnn}, latency_s: 0.5}}", "all lists half a second late"))
+    own = f", the ego's own, too: `latency_s: {{{ego[0]}: 0, default: 0.5}}` leaves it out" if ego else ""
+    rows.append(("late", f"{start}, {gnn}, latency_s: 0.5}}", f"all lists half a second late{own}"))
     link = f"{{{', '.join(f'{name}: none' for name in ego)}, default: radio}}" if ego else "radio"
     width = max(len(name) for name, _, _ in rows) + 1
     for name, value, what in rows:
