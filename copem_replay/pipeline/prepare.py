@@ -326,9 +326,9 @@ class Replay:
         return join_observations([self._observe(chunk, chunk.from_s, only_ix=object_ix) for chunk in self.chunks])
 
     def observe(self, chunk: TimeChunk, from_s: float | None = None) -> Observations:
-        """The observation rows captured in a time chunk, or from `from_s` on; cached for a whole log.
+        """What units observe in a time chunk, or from `from_s` on, as lists may arrive later; cached for a whole log.
 
-        Visible shares are there where a couple may apply, and of the ego.
+        Visible shares are there where a couple of the unit's PEM may apply, and of the ego; NaN elsewhere.
         """
         if chunk == TimeChunk():
             return self._whole

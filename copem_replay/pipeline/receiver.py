@@ -470,7 +470,7 @@ class Receivers:
         )
 
     def _fuse_by_truth_id(self, world: WorldChunk, name: str, output: ReceiverOutput) -> ReceiverOutput:
-        """The output with tracks of ideal fusion, or of the truth, at the configuration's instants."""
+        """The output with its tracks by truth id: of ideal fusion or the truth; expected states are drawn."""
         fusion, received = world.experiment.configurations[name].fusion, output.received
         fused_once = self._fuse_once(name, output)
         fused_tracks = fused_once.fused_tracks.arriving(received, output.instants.issue_s)
@@ -485,17 +485,17 @@ class Receivers:
         return replace(output, fused_tracks=fused_tracks, fused_once=fused_once)
 
     def _fuse_once(self, name: str, output: ReceiverOutput) -> FusedOnce:
-        """What ideal fusion makes of the lists; cached, for a sweep fuses lists of equal captures at many latencies."""
+        """Ideal fusion of the lists, without latency: cached, as a sweep asks for equal captures at many of them."""
         received, instants, max_age_s = output.received, output.instants, output.origin.max_age_s
-        partial, cached = output.origin.partial, None
+        partial, kept = output.origin.partial, None
         if partial.any():
-            cached = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
-        beside_newest = find_lists_beside_newest(received, instants, cached)
-        parts = (instants.newest, *beside_newest, *(() if cached is None else [cached.entry]))
-        captures, last_fused = b"".join(part.tobytes() for part in parts), self._last_fused
+            kept = keep_by_object(received, partial, self._schedules[name], instants, max_age_s=max_age_s)
+        beside_newest = find_lists_beside_newest(received, instants, kept)
+        chosen = (instants.newest, *beside_newest, *(() if kept is None else [kept.entry]))
+        captures, last_fused = b"".join(part.tobytes() for part in chosen), self._last_fused
         if last_fused is None or last_fused.sent is not output.sent or last_fused.captures != captures:
             ego = output.scene.ego_ix
-            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=ego, instants=instants, cached=cached)
+            fused = fuse_ideal(received, max_age_s=max_age_s, without_object_ix=ego, instants=instants, cached=kept)
             self._last_fused = last_fused = FusedOnce(output.sent, captures, replace(fused, scene=output.scene))
         return last_fused
 

@@ -429,7 +429,7 @@ def _measure_shape(
 def _estimate_bins(
     bins: tuple[RangeBin, ...], moments: Moments, shape: ErrorShape, error_m: Float, bin_ix: Int
 ) -> tuple[ErrorBin, ...]:
-    """The numbers of all bins, of Student's t where that is written."""
+    """The error of each bin: mean (m), covariance (m²) of the position; of Student's t where the fit writes that."""
     nu = shape.degrees_of_freedom
     if not shape.written:
         return tuple(estimate_bin(one, moments, b) for b, one in enumerate(bins))

@@ -55,10 +55,9 @@ def name_estimates(part: Any, name: str = "") -> Iterator[tuple[str, Estimate]]:
 
 
 def _list_members(part: Any) -> Iterator[tuple[str, Any]]:
+    """Name and value of each member of an estimate, columns of rows left out; none of a plain value."""
     if is_dataclass(part):
-        yield from (
-            (field.name, getattr(part, field.name)) for field in fields(part) if not field.metadata.get(PER_ROW)
-        )
+        yield from ((f.name, getattr(part, f.name)) for f in fields(part) if not f.metadata.get(PER_ROW))
     elif isinstance(part, Mapping):
         yield from ((" ".join(key) if isinstance(key, tuple) else str(key), value) for key, value in part.items())
     elif isinstance(part, list | tuple):

@@ -58,11 +58,11 @@ class Drives:
         value = float(self.needless_h.sum()) / total
         if self.over is None:
             return LimitedFigure(value)
-        share_without_drive = (self.needless_h.sum() - self.needless_h) / (total - self.hours)
+        share_without_each = (self.needless_h.sum() - self.needless_h) / (total - self.hours)
         by_run = self.over == "runs"
-        unseen_h = None if by_run else float((self.hours**2).sum() / total)
+        mean_drive_h = None if by_run else float((self.hours**2).sum() / total)
         runs = len(self.hours) if by_run else 0
-        return limit_left_out(value, share_without_drive, self.hours, (0.0, 1.0), confidence, unseen_h, runs)
+        return limit_left_out(value, share_without_each, self.hours, (0.0, 1.0), confidence, mean_drive_h, runs)
 
     def limit(self, metric: str, confidence: float) -> LimitedFigure:
         """`limit_rate` or `limit_share`, by the name of the figure: `RATE` or `SHARE`."""

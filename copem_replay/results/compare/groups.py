@@ -35,8 +35,8 @@ class EpisodeGroups:
     """
 
     def __init__(self, results: Results, entries: Sequence[str]) -> None:
-        self.named: list[tuple[Slice, str]] = []
-        self._of: dict[tuple[str, str, int], list[int]] = {}
+        self.named: list[tuple[Slice, str]] = []  # of each group what it is by, and its values
+        self._groups_of: dict[tuple[str, str, int], list[int]] = {}  # by log, object, episode
         if not entries:
             return
         tags = {log.name: log.tags for log in results.provenance.logs}
@@ -45,12 +45,12 @@ class EpisodeGroups:
         for entry in read_slices(results, entries):
             number, names = number_groups(episodes, entry, tags)
             for key, k in zip(keys, (number + len(self.named)).tolist(), strict=True):
-                self._of.setdefault(key, []).append(k)
+                self._groups_of.setdefault(key, []).append(k)
             self.named += [(entry, ", ".join(values)) for values in names]
 
     def select(self, log: str, grid: PairingGrid) -> Iterator[tuple[int, Bool]]:
         """The numbers of the groups with episodes of a log, and a mask (N·S,) of the cells of each."""
-        of_episodes = [self._of.get((log, *episode), []) for episode in grid.episodes]
+        of_episodes = [self._groups_of.get((log, *episode), []) for episode in grid.episodes]
         for k in sorted({k for of in of_episodes for k in of}):
             yield k, np.repeat([k in of for of in of_episodes], grid.runs)
 
