@@ -115,8 +115,8 @@ class ListFusion(Fusion):
 
         The list of instant k may depend on nothing that arrives later, nor on other runs, nor on the order of
         entries or units. Of its entries `captured_s` is the newest capture that contributed, that of a list that has
-        arrived, `unit_ix` the first unit that did (−1: not said), `track_id` an identity over time (−1: the algorithm
-        keeps none).
+        arrived, `unit_ix` a unit that did, chosen by what entries say (−1: not said), `track_id` an identity over time
+        (−1: the algorithm keeps none).
         """
 
     def resume(self, inputs: Inputs, memory: Any) -> tuple[ObjectLists, Any]:
