@@ -86,6 +86,7 @@ def test_lanes_see_the_same(sent: tuple[pd.DataFrame, Path]) -> None:
     assert np.bincount(before.state.ravel(), minlength=5)[[OUT_OF_VIEW, HIDDEN, IN_SIGHT]].min() > 50
 
 
+@pytest.mark.extras
 def test_what_hides_is_told_and_the_rest_is_as_recorded(sent: tuple[pd.DataFrame, Path]) -> None:
     """Without latency an object is known when it is listed: what the columns have until then is what causes have."""
     data = recorded(sent[1])
